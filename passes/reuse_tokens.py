@@ -1,4 +1,4 @@
-"""A tower for some of its tokens: those whose patches changed; the others keep what they gave."""
+"""A tower, or the scene, for some of its tokens: those that changed; the others keep what they gave."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -7,11 +7,11 @@ import numpy as np
 import torch
 
 from ttscompile.ir import pieces as names
-from ttscompile.ir.evaluate import evaluator
-from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice, copied
+from ttscompile.ir.evaluate import drawn, evaluator
+from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice, reshaped
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Program
-from ttscompile.ir.tokens import ATTENTION, TokenStream, find_tokens
+from ttscompile.ir.tokens import ATTENTION, TokenStream, find_sequence, find_tokens, read_whole
 
 from .base import Pass, PassResult
 
@@ -44,21 +44,27 @@ class ReuseTokens(Pass[Program, Program]):
     and their rows are written to ``places``: their own, and as many more. Nothing else reads what was kept, so a
     runtime may have it written where it is. With all tokens it is the tower. Which token is of which patch is found on
     numbers.
+
+    So does the scene, whose tokens are the rows of the sequence that its language model reads::
+
+        pixels_scene : %feature, %words -> %pixels : [B, 1, 140, 960]    # a row is the patch of its token
+        tokens_scene : %pixels, %words, %index, %places, %rows, %k.kept -> %k, %k.kept.new
     """
 
     def call(self, program: Program) -> PassResult[Program]:
         pieces, found, notes = program.pieces, dict[str, Graph](), list[str]()
         if pieces.tokens:
             return PassResult(program)
-        for i, tower in enumerate(pieces.towers):
-            stream = find_tokens(tower, program.weights)
+        for piece, graph in _candidates(program).items():
+            scene = piece == names.SCENE
+            stream = find_sequence(graph) if scene else find_tokens(graph, program.weights)
             if isinstance(stream, str):
-                notes.append(f"{names.frame_name(i)}: the whole frame is the unit: {stream}")
+                notes.append(f"{piece}: the whole {'scene' if scene else 'frame'} is the unit: {stream}")
                 continue
-            graph = for_tokens(tower, stream)
-            found |= {names.pixels_name(i): _pixels_graph(tower, stream), names.tokens_name(i): graph}
-            kept = sum(math.prod(type_.at(1)) for name, type_ in graph.inputs.items() if name not in names.NOT_KEPT)
-            notes.append(f"{names.frame_name(i)}: {stream.tokens} tokens, of which {kept * 4 / 1e6:.1f} MB are kept")
+            some = for_tokens(graph, stream)
+            found |= {names.pixels_name(piece): _pixels_graph(graph, stream), names.tokens_name(piece): some}
+            kept = sum(math.prod(type_.at(1)) for type_ in names.kept_inputs(some).values())
+            notes.append(f"{piece}: {stream.tokens} tokens, of which {kept * 4 / 1e6:.1f} MB are kept")
         if not found:
             return PassResult(program, tuple(notes))
         return PassResult(replace(program, pieces=replace(pieces, tokens=found)), tuple(notes))
@@ -66,26 +72,31 @@ class ReuseTokens(Pass[Program, Program]):
     def ensures(self, program: Program) -> None:
         """With all of its tokens the second form gives what the tower gives."""
         pieces, rng = program.pieces, np.random.default_rng(0)
-        for i, tower in enumerate(pieces.towers):
-            if names.tokens_name(i) not in pieces.tokens:
+        for piece, whole in _candidates(program).items():
+            if (some := pieces.tokens.get(names.tokens_name(piece))) is None:
                 continue
-            (name,) = tower.inputs
-            row = torch.from_numpy(rng.standard_normal(tower.inputs[name].at(1), dtype=np.float32))
-            graph = pieces.tokens[names.tokens_name(i)]
-            kept = {n: torch.full(t.at(1), torch.nan) for n, t in graph.inputs.items() if n not in names.NOT_KEPT}
-            tokens = torch.arange(next(iter(kept.values())).shape[0])
+            pixels = pieces.tokens[names.pixels_name(piece)]
+            given = {name: drawn(type_, 1, rng) for name, type_ in whole.inputs.items()}
+            given |= {name: torch.full(type_.at(1), torch.nan) for name, type_ in names.kept_inputs(some).items()}
+            tokens = torch.arange(next(iter(names.kept_inputs(some).values())).at(1)[0])
+            given |= {names.INDEX: tokens, names.PLACES: tokens.repeat(2), names.ROWS: tokens.repeat(2)}
+            results = list[tuple[torch.Tensor, ...]]()
             with torch.no_grad():
-                whole = evaluator(tower, program.weights)({name: row})
-                (pixels,) = evaluator(pieces.tokens[names.pixels_name(i)], program.weights)({name: row})
-                twice = {names.PLACES: tokens.repeat(2), names.ROWS: tokens.repeat(2)}
-                parts = evaluator(graph, program.weights)({names.PIXELS: pixels, names.INDEX: tokens, **twice, **kept})
-            for output, one, other in zip(tower.outputs, whole, parts, strict=False):
+                for graph in (whole, pixels, some):
+                    results.append(evaluator(graph, program.weights)({name: given[name] for name in graph.inputs}))
+                    given |= zip(graph.outputs[:1] * (graph is pixels), results[-1], strict=False)
+            for output, one, other in zip(whole.outputs, results[0], results[2], strict=False):
                 if not torch.allclose(one, other, rtol=0, atol=_CLOSE * float(one.abs().max()), equal_nan=True):
                     raise self.fail(f"%{output} of all tokens is not what the tower gives.")
 
 
+def _candidates(program: Program) -> dict[str, Graph]:
+    """What may have tokens, by the name of its piece, towers first."""
+    return {name: graph for name, graph in program.pieces.once().items() if name not in (names.FRAMES, names.CONDITION)}
+
+
 def for_tokens(tower: Graph, stream: TokenStream) -> Graph:
-    """The tower for some of its tokens."""
+    """The tower, or the scene, for some of its tokens."""
     return _Changed(tower, stream).graph()
 
 
@@ -99,11 +110,16 @@ def _of_some(type_: TensorType, axis: int) -> TensorType:
     return type_.resized(_rowless).with_axis(axis, Batch())
 
 
+def _pixels_type(type_: TensorType) -> TensorType:
+    """Of what patches are cut from; the rows of a sequence are those of a picture of one channel."""
+    return type_ if len(type_.shape) == 4 else replace(type_, shape=(type_.shape[0], 1, *type_.shape[1:]))
+
+
 def _pixels_graph(tower: Graph, stream: TokenStream) -> Graph:
     """The row to what patches are cut from, under a name of its own."""
     graph = backward_slice(tower, (stream.pixels,), {})
-    copy = copied(names.PIXELS, stream.pixels, tower.types()[stream.pixels])
-    return replace(graph, inputs=tower.inputs, nodes=(*graph.nodes, copy), outputs=(names.PIXELS,))
+    copy = reshaped(names.PIXELS, stream.pixels, _pixels_type(tower.types()[stream.pixels]))
+    return replace(graph, nodes=(*graph.nodes, copy), outputs=(names.PIXELS,))
 
 
 @dataclass
@@ -134,7 +150,9 @@ class _Changed:
         sizes = {names.INDEX: 1, names.PLACES: 2, names.ROWS: 2}
         numbers = {name: TensorType((Batch(size),), "int64") for name, size in sizes.items()}
         pixels = types[stream.pixels].resized(_rowless)
-        self.nodes.append(copied(stream.pixels, names.PIXELS, pixels))
+        self.nodes.append(reshaped(stream.pixels, names.PIXELS, pixels))
+        if stream.entry == stream.pixels:
+            self._enter(stream.entry)
         for node in own.nodes:
             if node.name in axes and node.name != stream.entry:
                 self._changed(node)
@@ -142,13 +160,18 @@ class _Changed:
             for name in node.refs():
                 self._whole(name)
             self.nodes.append(node.resized(_rowless))
-            self.there.add(node.name)
             if node.name == stream.entry:
-                self._gather(node.name, axes[node.name])
+                self._enter(node.name)
         for name in own.outputs:
             self._whole(name)
-        given = {names.PIXELS: pixels, **numbers, **self.inputs}
+        beside = {name: type_.resized(_rowless) for name, type_ in own.inputs.items() if name != stream.pixels}
+        given = {names.PIXELS: _pixels_type(pixels), **numbers, **beside, **self.inputs}
         return Graph(given, own.constants, tuple(self.nodes), (*own.outputs, *self.outputs))
+
+    def _enter(self, name: str) -> None:
+        """Take the rows of the tokens that are computed out of what is there for all."""
+        self.there.add(name)
+        self._gather(name, self.stream.axes[name])
 
     def _gather(self, name: str, axis: int) -> Ref:
         if not any(node.name == f"{name}.changed" for node in self.nodes):
@@ -161,13 +184,14 @@ class _Changed:
         axes, axis = self.stream.axes, self.stream.axes[node.name]
         types = tuple(_of_some(type_, axis) for type_ in node.types)
         elementwise, behind = operation(node.op).elementwise, len(node.type.shape) - axis
+        of_all = read_whole(node, axes)
 
         def operand(place: int, argument: Argument) -> Argument:
             if isinstance(argument, tuple):
                 return tuple(operand(place, item) for item in argument)
             if not isinstance(argument, Ref):
                 return _rowless(argument) if isinstance(argument, Batch) else argument
-            if node.op == ATTENTION and place in (1, 2):
+            if place in of_all:
                 self._whole(argument.name)
                 return argument
             if argument.name in axes:
@@ -180,7 +204,7 @@ class _Changed:
             return argument
 
         args = tuple(operand(place, argument) for place, argument in enumerate(node.args))
-        if node.op == "aten.reshape.default":
+        if node.op in ("aten.reshape.default", "aten.expand.default"):
             args = (args[0], types[0].shape)
         kwargs = tuple((name, operand(-1, value)) for name, value in node.kwargs)
         self.nodes.append(replace(node, name=f"{node.name}.changed", args=args, kwargs=kwargs, types=types))
@@ -192,7 +216,7 @@ class _Changed:
         self.there.add(name)
         node, axis = self.makers[name], self.stream.axes[name]
         type_ = node.type.resized(_rowless)
-        if operation(node.op).movement in (Movement.RESHAPE, Movement.PERMUTE):
+        if operation(node.op).movement in (Movement.RESHAPE, Movement.PERMUTE, Movement.REPEAT):
             for read in node.refs():
                 self._whole(read)
             self.nodes.append(node.resized(_rowless))

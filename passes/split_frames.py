@@ -10,7 +10,7 @@ import torch
 
 from ttscompile.core.spec import COMMITTED, ObservationSpec
 from ttscompile.ir.dataflow import reachable_from
-from ttscompile.ir.evaluate import evaluator
+from ttscompile.ir.evaluate import drawn, evaluator
 from ttscompile.ir.flops import graph_flops, node_flops, once_flops
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType, backward_slice, copied, reshaped
 from ttscompile.ir.operations import Movement, operation
@@ -24,6 +24,7 @@ MOST_BEFORE = 0.25
 """What is computed before the rows are there is computed at every call: this share of the tower's FLOPs at most."""
 LEAST_SHARE = 0.1
 """Of the scene, of all that is computed before the loop, but for step values."""
+_FRAME = ".frame"
 _CLOSE = 1e-3
 """Share of a tower's largest number by which batches of one and of two rows may differ: rounding is below it."""
 
@@ -147,9 +148,14 @@ def _is_frame(spec: ObservationSpec) -> bool:
 
 
 def _parted(graph: Graph, changing: Collection[str]) -> tuple[Graph, Graph]:
-    """What none of these inputs reaches, giving values with one axis of streams; and the rest, which reads them."""
-    still, types = tuple(name for name in graph.inputs if name not in changing), graph.types()
-    exits = _following(graph, still, 1, reachable_from(graph, graph.inputs), changing)
+    """What none of these inputs reaches, giving values with one axis of streams; and the rest, which reads them.
+
+    Pictures that are handed on as they are stay in the rest: they are no reason to compute a scene again.
+    """
+    still, types, users = tuple(name for name in graph.inputs if name not in changing), graph.types(), graph.users()
+    shown = {name for name in still if len(types[name].shape) > 3 and not name.endswith(_FRAME)}
+    copies = {n.name for n in graph.nodes if {*n.refs()} <= shown and operation(n.op).movement and not users[n.name]}
+    exits = _following(graph, still, 1, reachable_from(graph, graph.inputs), {*changing, *copies})
     scene = backward_slice(graph, exits, {})
     outputs = tuple(name for name in graph.outputs if name not in exits)
     rest = backward_slice(graph, outputs, {name: types[name] for name in exits})
@@ -245,7 +251,7 @@ def _is_exit(graph: Graph, name: str, rows: int) -> bool:
 
 
 def _crossing(name: str) -> str:
-    return f"{name}.frame"
+    return f"{name}{_FRAME}"
 
 
 def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
@@ -315,22 +321,16 @@ def _one_frame_a_row(
         return True
     before, rng = backward_slice(graph, tower.entries, {}), np.random.default_rng(0)
     run = evaluator(before, weights)
-    obs = {name: _drawn(type_, 1, rng) for name, type_ in before.inputs.items()}
+    obs = {name: drawn(type_, 1, rng) for name, type_ in before.inputs.items()}
     with torch.no_grad():
         (rows,) = run(obs)
         changes = torch.zeros(len(rows))
         for key, value in obs.items():
             for frame in range(lengths[key]):
                 other = value.clone()
-                other[:, frame] = _drawn(before.inputs[key], 1, rng)[:, frame]
+                other[:, frame] = drawn(before.inputs[key], 1, rng)[:, frame]
                 changes += (run({**obs, key: other})[0] != rows).flatten(1).any(1)
     return bool((changes <= 1).all())
-
-
-def _drawn(type_: TensorType, rows: int, rng: np.random.Generator) -> torch.Tensor:
-    real = type_.dtype.startswith("float")
-    drawn = rng.standard_normal(type_.at(rows)) if real else rng.integers(0, 2, type_.at(rows))
-    return torch.from_numpy(drawn.astype(type_.dtype))
 
 
 def _require_apart(each: SplitFrames, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> None:
@@ -342,7 +342,7 @@ def _require_apart(each: SplitFrames, tower: Graph, weights: Mapping[str, npt.ND
 def _beside(graph: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> list[str]:
     """The outputs whose second half, for two rows or streams, is not what the second one gives alone."""
     run, rng = evaluator(graph, weights), np.random.default_rng(0)
-    rows = {name: _drawn(type_, 2, rng) for name, type_ in graph.inputs.items()}
+    rows = {name: drawn(type_, 2, rng) for name, type_ in graph.inputs.items()}
     with torch.no_grad():
         both, alone = run(rows), run({name: value[len(value) // 2 :] for name, value in rows.items()})
     wrong = list[str]()

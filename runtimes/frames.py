@@ -32,7 +32,7 @@ from .tokens import Lane, Run, Seen, TokenTower, TokenWork
 
 Content: TypeAlias = "tuple[bytes | Lane | Result, ...]"
 """The bytes of one frame, of each input of the piece that reads it; before them its lane, if it has one. Of a scene the
-results for its frames come first."""
+results for its frames come first, after the lane."""
 Rows = TypeVar("Rows", Array, "list[Result]")
 Stop: TypeAlias = Callable[[], bool]
 Compute: TypeAlias = Callable[[int], tuple[tuple[Array, ...], "FrameWork"]]
@@ -51,10 +51,10 @@ class FrameWork:
         remembered: frames that were known.
         waited: ms that computing took.
         saved: ms that those remembered took when they were computed.
-        tokens: that were computed of the frames that were.
+        tokens: that were computed of the frames and scenes that were.
         forward: that took the rows of a computed one (FORWARD). The others kept their own (ROLLOUT).
-        of: how many tokens these frames have; 0 where tokens are not reused.
-        by_camera: the same of each of these frames, and why so many were computed.
+        of: how many tokens these have; 0 where tokens are not reused.
+        by_camera: the same of each of these, and why so many were computed; the camera of a scene is ``scene``.
         scenes: that were computed while the call waited, one for each stream at most.
         scenes_remembered: that were known.
     """
@@ -198,12 +198,14 @@ class FramePieces:
         streams, whole = len(next(iter(obs.values()))), {**obs, **found}
         shown = [self._memory[name].results(own) for name, own in known.items()]
         told = [obs[name] for name in scene.inputs if name in obs]
+        lanes = [Lane(b"%d" % streams, SCENE, stream) for stream in range(streams)]
+        kept = lanes if SCENE in self._tokens else ()  # what is kept of a stream is in its results
         contents: list[Content] = [
-            (*(one for rows in shown for one in _part(rows, s, streams)), *(rows[s].tobytes() for rows in told))
+            (*kept[s : s + 1], *(n for rows in shown for n in _part(rows, s, streams)), *(n[s].tobytes() for n in told))
             for s in range(streams)
         ]
         rows = [np.ascontiguousarray(whole[name]) for name in scene.inputs]
-        work = self._memory[SCENE].learn(contents, self._compute(SCENE, scene, rows, streams))
+        work = self._memory[SCENE].learn(contents, self._compute(SCENE, scene, rows, streams, lanes))
         done, before = work.computed, work.remembered
         self.work += replace(work, computed=0, remembered=0, scenes=done, scenes_remembered=before)
         return found | dict(zip(scene.outputs, self._memory[SCENE].values(contents), strict=True))

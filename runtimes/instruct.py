@@ -22,6 +22,8 @@ class Instruct:
         self._told, self._keys, self._read = spec.instruction, tuple(spec.observations), read
         self._length = spec.observations[self._told.tokens].shape[0]
         self._made: dict[tuple[str, str], list[int]] = {}
+        self._texts: list[str] | None = None
+        self._other = False
 
     @cached_property
     def _tokenizer(self) -> Tokenizer:
@@ -46,8 +48,17 @@ class Instruct:
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
             raise ObservationError(f"the task is {task!r:.80}; expected a text, or one for each stream.")
         states = self._states(rest, len(texts))
+        self._other, self._texts = self._other or self._texts not in (None, list(texts)), list(texts)
         tokens, mask = padded(list(map(self._tokens, texts, states)), self._length)
         return {**rest, self._told.tokens: tokens, self._told.mask: mask}
+
+    def other_task(self) -> bool:
+        """Whether a text was another one than that before it since this was asked last.
+
+        Tokens tell that, too, but where they hold a state: then what is kept of a scene has to be forgotten.
+        """
+        found, self._other = self._other and self._told.state is not None, False
+        return found
 
     def of_frame(self, frame: Mapping[str, Any]) -> Mapping[str, Any]:
         """The same for one frame of one robot, without the axis of streams."""

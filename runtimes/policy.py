@@ -306,6 +306,8 @@ class CompiledPolicy:
         obs = check_observation(obs, spec.observations)
         streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)
+        if self._instruct is not None and self._instruct.other_task():
+            self._runtime.frames.forget()
         reference = spec.chunk.reference(obs)
         if prefix is not None:
             prefix = check_prefix(prefix, streams, spec, self.prefix_refusal(wanted), reference)

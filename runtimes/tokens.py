@@ -1,7 +1,8 @@
-"""A tower computed for the tokens whose patches changed: ``docs/design.md`` section 2, tokens.
+"""A tower, or the scene, computed for the tokens that changed: ``docs/design.md`` section 2, tokens.
 
 What a token gave is kept by camera and stream of the batch, with the pixels that it was computed for. A new frame is
-held against these pixels, not against the frame before, so that slow changes add up until they are seen.
+held against these pixels, not against the frame before, so that slow changes add up until they are seen. The pixels of
+a scene are its sequence: a token's own row is its patch.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,13 +12,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ttscompile.artifact.manifest import MANIFEST, Manifest
+from ttscompile.artifact.manifest import MANIFEST, Manifest, PieceRecord
 from ttscompile.artifact.strict_json import REMEDY
 from ttscompile.artifact.towers import TokensRecord
 from ttscompile.core.coercion import Array
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import ArtifactError
-from ttscompile.ir.pieces import INDEX, PIXELS, PLACES, ROWS, frame_pieces, pixels_name, tokens_name
+from ttscompile.ir.pieces import INDEX, PIXELS, PLACES, ROWS, SCENE, pixels_name, tokens_name
 
 Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
 """A piece, by its name, on inputs by theirs; its outputs in order."""
@@ -36,6 +37,10 @@ class Lane(NamedTuple):
 
 EIGHTHS = (1, 2, 3, 4, 6)
 """A frame is computed for so many eighths of its tokens, or for all: few shapes, so that one was met before."""
+
+
+_LEAST = np.float32(1e-12)
+"""Added where something is divided by a sum that may be 0."""
 
 
 def sizes_of(tokens: int) -> tuple[int, ...]:
@@ -104,6 +109,7 @@ class Kept:
         work: for the newest frame.
         index: of the tokens that were computed for it.
         forward: of those that took the rows of a computed one.
+        told: what its row said in integers: the instruction of a scene.
         age: new frames since all tokens were computed.
         number: of the newest frame.
         bound: what ``renew`` has bound to the arrays, by how many rows each of its inputs has.
@@ -116,6 +122,7 @@ class Kept:
     work: TokenWork
     index: Array
     forward: Array
+    told: bytes
     age: int = 0
     number: int = 0
     bound: dict[tuple[int, ...], Any] = field(default_factory=dict)
@@ -123,19 +130,31 @@ class Kept:
 
 
 class TokenTower:
-    """A frame piece that computes some of its tokens.
+    """A frame piece, or the scene, that computes some of its tokens.
 
     Args:
-        names: of the piece that makes of a row what patches are cut from, and of the piece for some tokens.
-        forward: whether the piece writes rows of computed tokens to others, too. One of an older artifact does not.
+        name: of the piece.
+        pieces: with the piece that makes of a row what patches are cut from, and the piece for some tokens.
+        told: whether what is said in integers is the same as long as what is kept is of use.
         run, renew: the first and the second of these.
     """
 
     def __init__(
-        self, names: tuple[str, str], record: TokensRecord, reuse: TokenReuse, forward: bool, run: Run, renew: Renew
+        self,
+        name: str,
+        pieces: Mapping[str, PieceRecord],
+        record: TokensRecord,
+        reuse: TokenReuse,
+        told: bool,
+        run: Run,
+        renew: Renew,
     ) -> None:
-        (self._pixels, self._part), self._run, self._renew = names, run, renew
-        self._record, self._reuse, self._forward = record, reuse, forward
+        self._pixels, self._part, self._scene = pixels_name(name), tokens_name(name), name == SCENE
+        self._run, self._renew, self._record, self._reuse, self._told = run, renew, record, reuse, told
+        self._cut, self._reads = pieces[self._pixels].inputs, pieces[self._part].inputs
+        self._threshold = reuse.scene if self._scene else reuse.threshold
+        self._always = np.array([*range(record.fixed), *record.words], np.int64)
+        self._free = np.setdiff1d(np.arange(record.tokens), self._always) - record.fixed
         self._lanes: dict[Lane, Kept] = {}
 
     @property
@@ -156,26 +175,30 @@ class TokenTower:
             yield Seen(kept.pixels.copy(), computed, forward, self._record.patch, kept.number, kept.work)
 
     def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], TokenWork]:
-        """What the tower gives for a new frame, a row ``[1, ...]`` by the input of the frame piece, and what was done.
+        """What the piece gives for a new frame, a row ``[1, ...]`` by its inputs, and what was done.
 
-        What is kept of the lane is gone if this fails.
+        What is kept of the lane is gone if this fails. It is of no use where something else is said: all tokens of a
+        scene have seen the words.
 
         Raises:
             ArtifactError: the manifest cuts the picture into other patches than there are tokens.
         """
-        kept = self._lanes.pop(lane, None)
-        (pixels,) = self._run(self._pixels, row)
+        words = [one for one in row.values() if self._told and one.dtype.kind != "f"]
+        kept, told = self._lanes.pop(lane, None), b"".join(one.tobytes() for one in words)
+        if kept is not None and kept.told != told:
+            kept = None
+        (pixels,) = self._run(self._pixels, {name: row[name] for name in self._cut})
         if kept is None:
             self._require_patches(pixels[0])
         index, off, work = self._changed(kept, pixels[0], lane)
         if kept is None:
             nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
-            kept = Kept(pixels[0], nothing, (), work, index, index[:0])
+            kept = Kept(pixels[0], nothing, (), work, index, index[:0], told)
         else:
             kept.age, kept.number, kept.forward = kept.age + 1, kept.number + 1, index[:0]
         if index.size:
-            feed = {PIXELS: pixels, INDEX: index}
-            if self._forward:
+            feed = {PIXELS: pixels, INDEX: index, **{n: row[n] for n in self._reads if n in row}}
+            if PLACES in self._reads:  # an older artifact knows no FORWARD
                 kept.forward, rows = self._similar(kept.pixels, pixels[0], index, off)
                 feed |= _written(index, kept.forward, rows)
             kept.values = self._renew(self._part, feed, kept)
@@ -194,18 +217,20 @@ class TokenTower:
 
         Of a frame that is computed whole anyway nobody asks how much differs, and nothing is said.
         """
-        fixed, tokens = self._record.fixed, self.tokens
+        fixed, tokens, free = self._record.fixed, self.tokens, self._free
         work = partial(TokenWork, tokens, camera=lane.camera, stream=lane.stream)
         if kept is None or kept.age + 1 >= self._reuse.refresh:
             return np.arange(tokens), np.zeros(0, np.float32), work(refresh=tokens) if kept else work(first=tokens)
         off = self._differences(pixels, kept.pixels)
-        changed = int(np.count_nonzero(off > self._reuse.threshold))
+        changed = int(np.count_nonzero(off[free] > self._threshold))
         if not changed:
             return np.arange(0), off, work()
-        size = next((size for size in sizes_of(tokens) if size >= fixed + changed), tokens)
+        least = len(self._always)
+        size = next((size for size in sizes_of(tokens) if size >= least + changed), tokens)
         index = np.arange(size)
         if size < tokens:
-            index[fixed:] = fixed + np.sort(np.argpartition(-off, size - fixed - 1)[: size - fixed])
+            most = np.argpartition(-off[free], size - least - 1)[: size - least]
+            index = np.sort(np.concatenate([self._always, fixed + free[most]]))
         return index, off, work(changed=changed, filled=size - changed)
 
     def _similar(self, old: Array, new: Array, index: Array, off: Array) -> tuple[Array, Array]:
@@ -215,7 +240,9 @@ class TokenTower:
         for. They are at most as many as are computed: those that gain most.
         """
         fixed, computed = self._record.fixed, index[self._record.fixed :] - self._record.fixed
-        others = np.setdiff1d(off.nonzero()[0], computed, assume_unique=True) if len(index) < self.tokens else index[:0]
+        # The keys of a scene are turned by their place in the sequence: another token's are of another place.
+        some = len(index) < self.tokens and not self._scene
+        others = np.setdiff1d(off.nonzero()[0], computed, assume_unique=True) if some else index[:0]
         if not others.size:
             return others, others
         one, known = self._of(new, others), self._of(new, computed)
@@ -242,7 +269,7 @@ class TokenTower:
             )
 
     def _differences(self, one: Array, other: Array) -> Array:
-        """The mean absolute difference of each patch of ``[C, H, W]``, row by row."""
+        """The mean absolute difference of each patch of ``[C, H, W]``, row by row; in a scene, of its numbers' mean."""
         high, wide = self._record.patch
         rows, columns = one.shape[1] // high, one.shape[2] // wide
         off = one[:, : rows * high, : columns * wide] - other[:, : rows * high, : columns * wide]
@@ -250,7 +277,9 @@ class TokenTower:
         # Long rows first: a mean over all three axes at once takes twelve times as long.
         bands = off.reshape(len(off), rows, high, columns * wide).sum((0, 2))
         total: Array = bands.reshape(rows, columns, wide).sum(-1).ravel()
-        return total / (len(off) * high * wide)
+        # Features have no unit of their own, as pixels have.
+        count = np.abs(other).sum((0, 2)) + _LEAST if self._scene else len(off) * high * wide
+        return np.asarray(total / count)
 
     def _patches(self, pixels: Array) -> Array:
         """A view ``[C, rows, columns, height, width]`` of the patches of ``[C, H, W]``."""
@@ -271,12 +300,18 @@ def _written(index: Array, places: Array, rows: Array) -> dict[str, Array]:
 
 
 def token_towers(manifest: Manifest, reuse: TokenReuse | None, run: Run, renew: Renew) -> dict[str, TokenTower]:
-    """By frame piece, those that reuse tokens; none where ``reuse`` is None."""
+    """By piece, those that reuse tokens; none where ``reuse`` is None."""
     if reuse is None:
         return {}
-    towers = dict[str, TokenTower]()
-    for i, name in enumerate(frame_pieces(manifest.pieces)):
-        if name in manifest.tokens:
-            names, part = (pixels_name(i), tokens_name(i)), manifest.pieces[tokens_name(i)]
-            towers[name] = TokenTower(names, manifest.tokens[name], reuse, PLACES in part.inputs, run, renew)
+    words, towers = manifest.spec.instruction, dict[str, TokenTower]()
+    for name in reusing(manifest, reuse):
+        # A picture may be of integers; and words that hold a state are others in every call (``Instruct.other_task``).
+        told = name == SCENE and (words is None or words.state is None)
+        towers[name] = TokenTower(name, manifest.pieces, manifest.tokens[name], reuse, told, run, renew)
     return towers
+
+
+def reusing(manifest: Manifest, reuse: TokenReuse | None) -> list[str]:
+    """The pieces of which some tokens are computed, by name."""
+    own = [] if reuse is None else list(manifest.tokens)
+    return [name for name in own if name != SCENE or (reuse is not None and reuse.scene is not None)]

@@ -33,6 +33,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.core.plan import TokenReuse
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.tokens import TokenWork
 
 Array = npt.NDArray[np.float32]
 
@@ -88,7 +89,9 @@ def _middle(square: npt.NDArray[np.uint8], height: int, width: int) -> Array:
     return np.divide(cut, 255, dtype=np.float32)
 
 
-def measured(folder: Path, thresholds: Sequence[float], calls: int, patterned: bool) -> dict[str, Calls]:
+def measured(
+    folder: Path, thresholds: Sequence[float], calls: int, patterned: bool, scenes: Sequence[float] = ()
+) -> dict[str, Calls]:
     """Calls of each way by its name, but for the first of each episode, which computes all.
 
     Args:
@@ -96,13 +99,17 @@ def measured(folder: Path, thresholds: Sequence[float], calls: int, patterned: b
         thresholds: of ``TokenReuse``.
         calls: of each way.
         patterned: whether the second camera sees another picture in every call.
+        scenes: of ``TokenReuse``, each with every threshold; beside these the scene is computed whole.
     """
     artifact = load_artifact(folder / "compiled")
     bits, (obs, noise) = lowered(artifact), call(artifact.manifest.spec)
     cameras = [key for key, one in artifact.manifest.spec.observations.items() if one.image]
-    settings = {WHOLE: None, **{f"threshold {one:g}": TokenReuse(one, 10**6) for one in thresholds}}
+    settings: dict[str, TokenReuse | None] = {WHOLE: None}
+    for least in thresholds:
+        settings[f"threshold {least:g}"] = TokenReuse(least, 10**6)
+        settings |= {f"threshold {least:g}, scene {share:g}": TokenReuse(least, 10**6, share) for share in scenes}
     plans = {name: list(plans_of(artifact, bits, COMPUTED, one).values())[-1] for name, one in settings.items()}
-    opened = {name: open_policy(artifact, seed=0, plan=plan) for name, plan in plans.items()}
+    policy = open_policy(artifact, seed=0)  # one for all: what they have in common is in memory once
     rng = np.random.default_rng(1)
     other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
     found = {name: Calls() for name in [*plans, OTHER]}
@@ -113,17 +120,19 @@ def measured(folder: Path, thresholds: Sequence[float], calls: int, patterned: b
         for key, one in seen.items():
             obs[key] = np.stack([one] * obs[key].shape[1])[None]
         if first:
-            for policy in opened.values():
-                policy.reset()
-        made = {name: _timed(policy, obs, noise, plans[name]) for name, policy in opened.items()}
+            policy.reset()
+        made, works = dict[str, tuple[Array, float]](), dict[str, tuple[TokenWork, ...]]()
+        for name, plan in plans.items():
+            made[name] = _timed(policy, obs, noise, plan)
+            works[name] = () if policy.last_report is None else policy.last_report.frames.by_camera
         if first:
             continue
-        made[OTHER] = _timed(opened[WHOLE], obs, other, plans[WHOLE])
+        made[OTHER] = _timed(policy, obs, other, plans[WHOLE])
         for name, (actions, seconds) in made.items():
             found[name].off.append(float(np.abs(actions - made[WHOLE][0]).mean()))
             found[name].seconds.append(seconds)
             if name in settings:
-                found[name].shares.append([float(one.computed.mean()) for one in opened[name].seen()])
+                found[name].shares.append([one.computed / one.of for one in works[name]])
         if len(found[WHOLE].seconds) == calls:
             break
     return found
@@ -139,16 +148,18 @@ def _timed(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan:
 @click.command(context_settings={"show_default": True})
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--thresholds", default="0.02,0.05,0.1,0.2", help="Of token reuse.")
+@click.option("--scenes", default="", help="Shares of a scene's rows, for the same.")
 @click.option("--calls", default=16, type=click.IntRange(1), help="Of each way.")
 @click.option("--patterned", is_flag=True, help="All that the gripper's camera sees is new in every call.")
-def main(folder: Path, thresholds: str, calls: int, patterned: bool) -> None:
+def main(folder: Path, thresholds: str, scenes: str, calls: int, patterned: bool) -> None:
     """Time calls of the policy in FOLDER."""
-    found = measured(folder, [float(one) for one in thresholds.split(",")], calls, patterned)
+    shares = [float(one) for one in scenes.split(",") if one]
+    found = measured(folder, [float(one) for one in thresholds.split(",")], calls, patterned, shares)
     whole = statistics.median(found[WHOLE].seconds)
     for name, one in found.items():
         seconds = statistics.median(one.seconds)
-        shares = ", ".join(f"{statistics.mean(own):.0%}" for own in zip(*one.shares, strict=True))
-        computed = f"; computed, by camera: {shares}" if shares else ""
+        parts = ", ".join(f"{statistics.mean(own):.0%}" for own in zip(*one.shares, strict=True))
+        computed = f"; computed, by camera, and of the scene: {parts}" if parts else ""
         off = f"{statistics.mean(one.off):8.3f}  actions off those with all tokens"
         print(f"{off}; {seconds:.2f} s, {seconds / whole:.2f} of theirs{computed}: {name}")
 

@@ -4,8 +4,9 @@
 
 A token is computed where its patch differs by more than a threshold; the plan is dense otherwise. One that is not
 computed may have the rows of a similar one of the same frame (``docs/design.md`` section 2); with ``--kept`` each keeps
-its own. The other options, the seeds and the tables are those of ``evaluate.py``. At the end stands
-how many of the tokens of new frames were computed, first frames of an episode left out.
+its own. With ``--scenes 0.2`` a token of the scene is computed where its row differs by more than this share. The other
+options, the seeds and the tables are those of ``evaluate.py``. At the end stands how many of the tokens of new frames
+and scenes were computed, first ones of an episode left out.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from environments import Array
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.plan import DENSE, TokenReuse
+from ttscompile.ir.pieces import SCENE
 from ttscompile.runtimes.tokens import Lane, TokenTower, TokenWork
 
 REFRESH = 32
@@ -35,11 +37,11 @@ class Counted:
     """In place of ``TokenTower.compute``, and of what finds similar tokens where ``kept``.
 
     Attributes:
-        computed: by threshold the tokens of new frames that were computed, and how many there were.
+        computed: by setting, and whether it is the scene, the tokens that were computed, and how many there were.
     """
 
     def __init__(self, kept: bool) -> None:
-        self._kept, self.computed = kept, dict[float, Array]()
+        self._kept, self.computed = kept, dict[tuple[TokenReuse, bool], Array]()
         self._compute = TokenTower.compute
 
     def patch(self, setattribute: Callable[[type, str, object], None]) -> None:
@@ -53,16 +55,18 @@ class Counted:
         known = lane in tower._lanes
         values, work = self._compute(tower, lane, row)
         if known:
-            self.computed.setdefault(tower._reuse.threshold, np.zeros(2, np.int64))[:] += work.computed, work.of
+            key = tower._reuse, lane.camera == SCENE
+            self.computed.setdefault(key, np.zeros(2, np.int64))[:] += work.computed, work.of
         return values, work
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("directory", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--thresholds", required=True, help="Differences of patches, with commas between them.")
+@click.option("--scenes", default="", help="Shares of a scene's rows, each with every threshold; none: whole scenes.")
 @click.option("--kept", is_flag=True, help="No token has the rows of another one.")
 @click.argument("options", nargs=-1, type=click.UNPROCESSED)
-def main(directory: Path, thresholds: str, kept: bool, options: tuple[str, ...]) -> None:
+def main(directory: Path, thresholds: str, scenes: str, kept: bool, options: tuple[str, ...]) -> None:
     """Evaluate the policy of the artifact in DIRECTORY with fewer tokens."""
     counted = Counted(kept)
     counted.patch(setattr)
@@ -70,14 +74,18 @@ def main(directory: Path, thresholds: str, kept: bool, options: tuple[str, ...])
         folder = Path(shutil.copytree(directory, Path(own) / directory.name))
         plans = load_artifact(folder).plans
         some = {
-            f"over-{one}": replace(plans[DENSE], tokens=TokenReuse(float(one), REFRESH))
+            f"over-{one}{f'-scene-{share}' * bool(share)}": replace(
+                plans[DENSE], tokens=TokenReuse(float(one), REFRESH, float(share) if share else None)
+            )
             for one in thresholds.split(",")
+            for share in scenes.split(",")
         }
         update_plans(folder, {**plans, **some}, DENSE)
         driven = [f"{folder}:{name}" for name in (DENSE, *some)]
         evaluate.main([*driven, *options, "--no-cache"], standalone_mode=False)
-    for threshold, (computed, of) in counted.computed.items():
-        click.echo(f"{threshold:g}: {computed / of:.1%} of the {of:,} tokens of new frames were computed")
+    for (reuse, scene), (computed, of) in counted.computed.items():
+        what = f"scenes over {reuse.scene:g}" if scene else "frames"
+        click.echo(f"{reuse.threshold:g}: {computed / of:.1%} of the {of:,} tokens of new {what} were computed")
 
 
 if __name__ == "__main__":

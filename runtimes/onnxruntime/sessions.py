@@ -37,7 +37,7 @@ from ttscompile.ir.pieces import Joint, join
 from ttscompile.measure.machine import has_integer_dot_product
 from ttscompile.measure.versions import release
 from ttscompile.runtimes.contexts import ContextValues
-from ttscompile.runtimes.tokens import Kept
+from ttscompile.runtimes.tokens import Kept, reusing
 
 SINGLE_THREADED = frozenset({kinds.STEM, kinds.ADVANCE, kinds.PRUNER, kinds.IDLE})
 """Pieces too small for a second thread."""
@@ -82,8 +82,10 @@ class Sessions:
         """
         manifest = view.manifest
         single = {kinds.block_name(b) for b in range(len(manifest.blocks))}
-        # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
-        unused = filter(kinds.of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
+        # A piece that reuses tokens computes all of them with the same session, so that its weights are there once.
+        own = reusing(manifest, view.variant.tokens)
+        beside = {make(name) for name in own for make in (kinds.pixels_name, kinds.tokens_name)}
+        unused = {*own, *filter(kinds.of_tokens, manifest.pieces)} - beside
         others = set(filter(kinds.is_of_loop, manifest.pieces))
         others |= {name for name, piece in manifest.pieces.items() if not piece.outputs}  # nothing is left to compute
         once = set(manifest.pieces) - single - {kinds.JOINT, kinds.LAYERS} - set(unused) - others
@@ -294,6 +296,10 @@ def run_piece(
     return tuple(run_named(sessions[name], pieces[name].outputs, inputs).values())
 
 
+_DTYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": np.bool_}
+"""Of what a piece for some tokens gives, by onnxruntime's name."""
+
+
 def renew_piece(sessions: Mapping[str, Any], name: str, inputs: Mapping[str, Array], kept: Kept) -> tuple[Array, ...]:
     """Run a piece for some tokens: what is kept gets its new rows where it is. Its other outputs, in order.
 
@@ -310,7 +316,7 @@ def renew_piece(sessions: Mapping[str, Any], name: str, inputs: Mapping[str, Arr
             own[kinds.PIXELS] = share(kinds.PIXELS, own[kinds.PIXELS])
             into = {kinds.renewed_name(key): array for key, array in kept.arrays.items()}
             others = [one for one in session.get_outputs() if one.name not in into]
-            made = {one.name: share(one.name, np.zeros(one.shape, np.float32)) for one in others}
+            made = {one.name: share(one.name, np.zeros(one.shape, _DTYPES[one.type])) for one in others}
             kept.bound[size] = own, made, Bound(session, {**own, **kept.arrays}, {**made, **into})
     except Exception as error:  # onnxruntime's own classes, and what it raises itself
         raise _failed(error) from error

@@ -58,7 +58,7 @@ def test_the_page_shows_it(once: Once, policy: CompiledPolicy) -> None:
     (section,) = (one for one in page.sections if one.title == "Episode")
     (shown,) = section.pictures
     work = run_episode(policy, episode()).frames
-    assert shown.caption.startswith(f"{work.tokens} of {work.of} tokens of the image encoders were computed")
+    assert shown.caption.startswith(f"{work.tokens} of {work.of} tokens of new frames and scenes were computed")
     drawn = np.asarray(Image.open(BytesIO(shown.png)).convert("RGB")).astype(int)
     half = len(drawn) // 2
     colourful = np.abs(drawn - drawn.mean(-1, keepdims=True)).max(-1) > 40

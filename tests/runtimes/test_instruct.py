@@ -1,6 +1,7 @@
 """The text of a task in place of its tokens, in what a robot gives."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,11 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ttscompile
+from tests.families import scenes
+from tests.once import Once
 from tests.runtimes.executor.simulation import FakeClock, ScriptedPolicy
 from tests.word_tokenizer import write_tokenizer
 from ttscompile.core.coercion import Errors
 from ttscompile.core.spec import Instruction, ObservationSpec
-from ttscompile.core.tokenizer import Tokenizer
+from ttscompile.core.tokenizer import StateInWords, Tokenizer
 from ttscompile.errors import ArtifactChangedError, ObservationError
 from ttscompile.runtimes.executor import AsyncExecutor
 from ttscompile.runtimes.instruct import Instruct, instruct_of
@@ -118,3 +122,40 @@ def test_an_executor_has_its_policy_make_tokens() -> None:
         assert executor.statistics().frames == 2
         with pytest.raises(ObservationError, match="unexpected: .'words'"):
             executor.observe({"words": "push"})
+
+
+def test_where_words_hold_a_state_another_text_is_told_once(spec: Any, tmp_path: Path) -> None:
+    """Tokens differ with every state, so they do not tell it; where they hold none, nobody has to ask."""
+    folder, state = write_tokenizer(tmp_path / "language", WORDS), StateInWords("state", (0.0,) * 5, (1.0,) * 5, False)
+    read = partial(Tokenizer, folder)
+    spec.observations |= {key: ObservationSpec((9,), dtype=spec.observations[key].dtype) for key in ("tokens", "mask")}
+    spec.instruction = replace(spec.instruction, around=("", " {state}"), state=state)
+    instruct, asked = Instruct(spec, read), list[bool]()
+    for text, moved in (("push left", 0.0), ("push left", 0.5), ("push right", 0.5), ("push right", 0.0)):
+        instruct.of_frame({"state": STATE[0] + np.float32(moved), "task": text})
+        asked.append(instruct.other_task())
+    assert asked == [False, False, True, False]
+    instruct({"state": np.zeros((2, 1, 5), np.float32), "task": ["push left", "push right"]})
+    instruct({"state": np.ones((2, 1, 5), np.float32), "task": ["push left", "push left"]})
+    assert instruct.other_task() and not instruct.other_task()
+    spec.instruction = replace(spec.instruction, around=(), state=None)
+    plain = Instruct(spec, read)
+    for text in ("left", "right"):
+        plain({"state": STATE, "task": text})
+        assert not plain.other_task()
+
+
+def test_a_policy_forgets_its_frames_where_it_is_told_so(once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = ttscompile.load(once.folder("scenes", scenes.compile_all) / "one", seed=0)
+    stub: Any = SimpleNamespace(other=False)
+
+    class Told:
+        def __call__(self, obs: Any) -> Any:
+            return obs
+
+        other_task = staticmethod(lambda: stub.other)
+
+    monkeypatch.setattr(policy, "_instruct", Told())
+    for stub.other, expected in ((False, (1, 0)), (False, (0, 1)), (True, (1, 0))):
+        scenes.act(policy, scenes.observation())
+        assert scenes.scenes(policy) == expected

@@ -158,6 +158,8 @@ def plan_fault(manifest: Manifest, plan: PlanRecord) -> str | None:
         return f"parts in the precision that the artifact has models in, {held or 'none'}"
     if plan.tokens is not None and not manifest.tokens:
         return "no reuse of tokens, because no frame piece has tokens"
+    if plan.tokens is not None and plan.tokens.scene is not None and names.SCENE not in manifest.tokens:
+        return "no reuse of a scene's tokens, because it has none"
     if (plan.otherwise is not None) != (plan.loop in manifest.starts):
         return "another plan for calls without a chunk exactly where the loop begins with one"
     other = manifest.plans.get(plan.otherwise or DENSE)
@@ -209,22 +211,25 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
 
 
 def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
-    """Each tower with tokens has its two pieces, which fit it and what is kept; and there are no others."""
-    known = {name: i for i, name in enumerate(names.frame_pieces(manifest.pieces))}
-    if not set(manifest.tokens) <= set(known):
-        fields["tokens"].fail(f"some of the frame pieces {sorted(known)}")
-    wanted = [make(known[name]) for name in manifest.tokens for make in (names.pixels_name, names.tokens_name)]
+    """What has tokens has its two pieces, which fit it and what is kept; and there are no others."""
+    known = {*names.frame_pieces(manifest.pieces), *{names.SCENE} & set(manifest.pieces)}
+    if not set(manifest.tokens) <= known:
+        fields["tokens"].fail(f"some of the pieces {sorted(known)}")
+    wanted = [make(name) for name in manifest.tokens for make in (names.pixels_name, names.tokens_name)]
     if sorted(wanted) != sorted(filter(names.of_tokens, manifest.pieces)):
         fields["pieces"].fail(f"for the sake of tokens exactly {sorted(wanted)}")
     for name, record in manifest.tokens.items():
-        frame, pixels, part = (
-            manifest.pieces[p] for p in (name, names.pixels_name(known[name]), names.tokens_name(known[name]))
-        )
-        rows = [kind.at(1)[:1] for kind in record.kept.values()]
-        fits = pixels.inputs == frame.inputs and pixels.outputs == (names.PIXELS,) and 0 <= record.fixed < record.tokens
+        own = (name, names.pixels_name(name), names.tokens_name(name))
+        frame, pixels, part = (manifest.pieces[piece] for piece in own)
+        rows, read = [kind.at(1)[:1] for kind in record.kept.values()], set(frame.inputs)
+        if [*record.words] != sorted({word for word in record.words if word < record.tokens}):
+            told = f"some of the numbers 0..{record.tokens - 1}, ascending"
+            fields["tokens"].members()[name].members()["words"].fail(told)
+        fits = set(pixels.inputs) <= read and pixels.outputs == (names.PIXELS,) and 0 <= record.fixed < record.tokens
         # In an older artifact each row goes to its own token, so the piece is not told where.
         beside = names.NOT_KEPT if names.PLACES in part.inputs else (names.PIXELS, names.INDEX)
-        fits = fits and sorted(part.inputs) == sorted((*beside, *record.kept))
+        known_inputs = {*beside, *record.kept}
+        fits = fits and known_inputs <= set(part.inputs) <= known_inputs | read
         renewed = tuple(map(names.renewed_name, record.kept))
         if not fits or part.outputs[len(frame.outputs) :] != renewed or set(rows) != {(record.tokens,)}:
             fields["tokens"].members()[name].fail("what the pieces of its tokens read and give")

@@ -62,18 +62,23 @@ def flops_record(program: Program) -> FlopsRecord:
 
 
 def tokens_records(program: Program) -> dict[str, TokensRecord]:
-    """The tokens of each tower that has a form for some of them, by its frame piece."""
-    records, pieces = {}, program.pieces
-    for i in range(len(pieces.towers)):
-        if (graph := pieces.tokens.get(names.tokens_name(i))) is None:
+    """The tokens of each tower, and of the scene, that has a form for some of them, by its piece."""
+    from ..ir.tokens import words_of  # it needs torch, which those who only read artifacts may not have
+
+    records = {}
+    for piece in program.pieces.once():
+        if (graph := program.pieces.tokens.get(names.tokens_name(piece))) is None:
             continue
-        kept = {n: kind for n, kind in graph.inputs.items() if n not in names.NOT_KEPT}
+        kept = names.kept_inputs(graph)
+        tokens = next(iter(kept.values())).at(1)[0]
+        if piece == names.SCENE:  # a row of the sequence is the patch of its token
+            words = words_of(program.pieces.tokens[names.pixels_name(piece)], program.weights)
+            records[piece] = TokensRecord(tokens, 0, (1, graph.inputs[names.PIXELS].at(1)[3]), kept, words)
+            continue
         patches = next(node for node in graph.nodes if node.op.startswith("aten.conv"))
         _, weight = list(patches.refs())[:2]
         high, wide = graph.constants[weight].at(1)[2:]
-        tokens = next(iter(kept.values())).at(1)[0]
-        fixed = tokens - math.prod(patches.type.at(1)[2:])
-        records[names.frame_name(i)] = TokensRecord(tokens, fixed, (high, wide), kept)
+        records[piece] = TokensRecord(tokens, tokens - math.prod(patches.type.at(1)[2:]), (high, wide), kept)
     return records
 
 
@@ -145,7 +150,7 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
             "loop": plan.loop,
             "weights": plan.weights,
             "precision": dict(sorted(plan.precision.items())),
-            "tokens": None if plan.tokens is None else dict(vars(plan.tokens)),
+            "tokens": None if plan.tokens is None else {n: v for n, v in vars(plan.tokens).items() if v is not None},
             "otherwise": otherwise,
         }
         if plan.cells is None:

@@ -162,6 +162,9 @@ def _require(manifest: Manifest, variant: Variant) -> None:
     if variant.tokens is not None and not manifest.tokens:
         remedy = "Leave tokens out of the plan: dataclasses.replace(plan, tokens=None)."
         raise IllegalPlanError(f"no image encoder of this policy has tokens that could be reused. {remedy}")
+    if variant.tokens is not None and variant.tokens.scene is not None and SCENE not in manifest.tokens:
+        remedy = "Leave the scene out: TokenReuse(threshold, refresh)."
+        raise IllegalPlanError(f"the scene of this policy, if it has one, has no tokens that could be reused. {remedy}")
 
 
 def require_held(artifact: Artifact, plan: Plan) -> None:

@@ -228,6 +228,8 @@ def _variants(name: str, plan: Plan) -> dict[str, Plan]:
         found[f"{name}@fp32"] = replace(plan, precision={})
     if plan.tokens is not None:  # looking for changes may take longer than a small encoder
         found[f"{name}, all tokens"] = replace(plan, tokens=None)
+        if plan.tokens.scene is not None:
+            found[f"{name}, whole scene"] = replace(plan, tokens=replace(plan.tokens, scene=None))
     return found
 
 

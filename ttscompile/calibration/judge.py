@@ -145,7 +145,7 @@ def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = T
                 runtime.predict(obs, noise, plan)  # so that there is a chunk to begin with
             runtime.forget_frames()
             if plan.tokens is not None and row and number != WARM_UP:  # once all tokens are computed
-                runtime.frames.learn(trials.observation([(int(sample.stretches[stretch, 0]), row - 1)]))
+                runtime.frames.values(trials.observation([(int(sample.stretches[stretch, 0]), row - 1)]))
             timer.time(i, partial(runtime.predict, obs, noise, plan))
             runtime.reset()
     return timer.times

@@ -16,7 +16,7 @@ from ..errors import IllegalPlanError
 from .coercion import integer
 from .correction import Correction
 from .lattice import PlanArray, Source
-from .rules import NotNegative, Positive
+from .rules import OMITTED, NotNegative, Positive
 from .spec import FP32, ORIGINAL as ORIGINAL
 
 DENSE = "dense"
@@ -31,24 +31,29 @@ UNIFORM = "uniform"
 
 @dataclass(frozen=True)
 class TokenReuse:
-    """When a token of an image encoder is computed anew.
+    """When a token of an image encoder, or of the scene, is computed anew.
 
     Attributes:
         threshold: a patch has changed where its pixels, as the encoder reads them, differ by more than this on average
             from those that its token was last computed for.
-        refresh: of so many new frames of a camera one is computed whole.
+        refresh: of so many new frames of a camera, and of so many new scenes, one is computed whole.
+        scene: a row of the sequence that the scene's language model reads has changed where its numbers differ by more
+            than this share of their mean size, both on average. None: all tokens of a new scene are computed.
     """
 
     threshold: NotNegative
     refresh: Positive
+    scene: NotNegative | None = field(default=None, metadata=OMITTED)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "refresh", integer(self.refresh, "refresh of a plan's tokens", IllegalPlanError, 1))
-        number = isinstance(self.threshold, Real) and not isinstance(self.threshold, bool)
-        if not number or not float(self.threshold) >= 0:  # a patch is never further than NaN from another one
-            wanted = "threshold of a plan's tokens: expected a number that is not negative"
-            raise IllegalPlanError(f"{wanted}; found {self.threshold!r:.80}.")
-        object.__setattr__(self, "threshold", float(self.threshold))
+        for name in ("threshold", *["scene"] * (self.scene is not None)):
+            value = getattr(self, name)
+            number = isinstance(value, Real) and not isinstance(value, bool)
+            if not number or not float(value) >= 0:  # a patch is never further than NaN from another one
+                wanted = f"{name} of a plan's tokens: expected a number that is not negative"
+                raise IllegalPlanError(f"{wanted}; found {value!r:.80}.")
+            object.__setattr__(self, name, float(value))
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ class Plan:
         correction: what is added to the sampler's steps, jumps included; None for nothing.
         weights: name of the weights that residual blocks have from step 1 on.
         precision: by part (``ir.pieces.part_of``) the precision of its weights; parts that are not named are in fp32.
-        tokens: when a token of an image encoder is computed anew; None: all tokens of all new frames are.
+        tokens: when a token of an image encoder or of the scene is computed anew; None: all of what is new are.
         otherwise: of a loop that begins with the chunk of the call before, the plan of a call that has none: the first
             of an episode, and one that is late. None for the loops that begin with noise.
         repair: whether reads of what was never computed are replaced and counted (``lattice.legalize``), or the call is
@@ -127,7 +132,8 @@ class Plan:
         for one in sorted(set(self.precision.values())):
             told.append(f"{one} in {' and '.join(part for part, own in self.precision.items() if own == one)}")
         told += [f"weights {self.weights!r}"] * (self.weights != ORIGINAL)
-        told += ["some tokens of each new frame"] * (self.tokens is not None)
+        if self.tokens is not None:
+            told += ["some tokens of each new frame" + " and scene" * (self.tokens.scene is not None)]
         told += ["from the chunk of the call before"] * (self.otherwise is not None)
         return ", ".join(told)
 

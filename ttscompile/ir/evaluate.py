@@ -267,3 +267,10 @@ def _where(node: Node) -> str:
 
 def _describe(value: torch.Tensor) -> str:
     return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+
+
+def drawn(type_: TensorType, rows: int, rng: np.random.Generator) -> torch.Tensor:
+    """Random numbers of a type, for so many rows: normal ones, or 0 and 1 of integers."""
+    real = type_.dtype.startswith("float")
+    numbers = rng.standard_normal(type_.at(rows)) if real else rng.integers(0, 2, type_.at(rows))
+    return torch.from_numpy(numbers.astype(type_.dtype))

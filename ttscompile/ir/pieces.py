@@ -100,23 +100,28 @@ def renewed_name(kept: str) -> str:
     return f"{kept}.new"
 
 
-def pixels_name(index: int) -> str:
-    """``pixels_00``: the row of a frame piece to what its patches are cut from."""
-    return f"{_PIXELS}{index:02d}"
+def kept_inputs(graph: Graph) -> dict[str, TensorType]:
+    """What a piece for some tokens keeps, by input, ``[T, ...]`` each."""
+    return {name: type_ for name, type_ in graph.inputs.items() if renewed_name(name) in graph.outputs}
 
 
-def tokens_name(index: int) -> str:
-    """``tokens_00``: a frame piece for some of its tokens."""
-    return f"{_TOKENS}{index:02d}"
+def pixels_name(piece: str) -> str:
+    """``pixels_00`` of ``frame_00``: its row to what patches are cut from; ``pixels_scene``: to the sequence."""
+    return _PIXELS + piece.removeprefix(_FRAME)
+
+
+def tokens_name(piece: str) -> str:
+    """``tokens_00`` of ``frame_00``, or ``tokens_scene``: the piece for some of its tokens."""
+    return _TOKENS + piece.removeprefix(_FRAME)
 
 
 def of_tokens(piece: str) -> bool:
-    """Whether a piece is there for the sake of single tokens: no call needs it that computes whole frames."""
+    """Whether a piece is there for the sake of single tokens: no call needs it that computes all of them."""
     return piece.startswith((_PIXELS, _TOKENS))
 
 
 def is_tokens(piece: str) -> bool:
-    """Whether a piece is a frame piece for some of its tokens."""
+    """Whether a piece is a frame piece, or the scene, for some of its tokens."""
     return piece.startswith(_TOKENS)
 
 
@@ -139,13 +144,14 @@ def part_of(piece: str) -> str | None:
 
     Returns:
         ``blocks`` for blocks and the pieces that hold all of them; the name of a piece of the prologue; and None for
-        pieces that are always in fp32: they are small, or no call needs them. A frame piece for some tokens belongs to
-        the part of the frame piece.
+        pieces that are always in fp32: they are small, or no call needs them. A piece for some tokens belongs to the
+        part of the piece for all of them.
     """
     if is_block(piece) or piece in OF_ALL_BLOCKS:
         return BLOCKS
     if of_tokens(piece):
-        return _FRAME + piece.removeprefix(_TOKENS) if is_tokens(piece) else None
+        own = piece.removeprefix(_TOKENS)
+        return (own if own == SCENE else _FRAME + own) if is_tokens(piece) else None
     return None if piece.partition(_OF_LOOP)[0] in _SMALL else piece
 
 

@@ -1,4 +1,4 @@
-"""The tokens of a vision transformer: which values of a tower have a row for each patch, and which row is of which."""
+"""The tokens of a vision transformer, and those of a scene's sequence: which values have a row for each of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,10 +8,10 @@ import numpy.typing as npt
 import torch
 
 from .dataflow import reachable_from
-from .evaluate import evaluator
+from .evaluate import drawn, evaluator
 from .flops import graph_flops, node_flops
 from .graph import Argument, Graph, Node, Ref, TensorType, backward_slice
-from .operations import axis_after, joined_axis, operation
+from .operations import Movement, axis_after, joined_axis, operation
 
 LEAST_TOKENS = 16
 """Of a tower: with fewer there is hardly a part of them to compute."""
@@ -19,16 +19,17 @@ MOST_WHOLE = 0.25
 """Share of a tower's FLOPs that may be spent on what is computed for every new frame, whatever changed in it."""
 ATTENTION = "aten.scaled_dot_product_attention.default"
 _CONVOLUTION, _CAT = "aten.conv2d.default", "aten.cat.default"
+_PRODUCTS = ("aten.matmul.default", "aten.bmm.default")
 
 Weights = Mapping[str, npt.NDArray[np.generic]]
 
 
 @dataclass(frozen=True)
 class TokenStream:
-    """The tokens of a tower.
+    """The tokens of a tower, or of a scene.
 
     Attributes:
-        pixels: the value that patches are cut from, ``[B, C, H, W]``.
+        pixels: the value that patches are cut from, ``[B, C, H, W]``; of a scene ``entry``.
         entry: the first value with a row for each token, ``[B, T, D]``.
         tokens: T.
         fixed: how many tokens, the first ones, are of no patch.
@@ -80,6 +81,56 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
     return stream
 
 
+def find_sequence(scene: Graph) -> TokenStream | str:
+    """The tokens that a scene puts one after the other, as a language model reads them; or why there are none."""
+    told, types = "nothing puts what towers give, and words, one after the other", scene.types()
+    for node in scene.nodes:
+        tokens = node.type.shape[1] if len(node.type.shape) == 3 else None
+        real = node.op == _CAT and node.type.dtype.startswith("float")
+        if not real or joined_axis(node) != 1 or not isinstance(tokens, int):
+            continue
+        entry = node.name
+        stream = TokenStream(entry, entry, tokens, 0, _axes(scene, entry, tokens))
+        total, behind = graph_flops(scene), reachable_from(scene, {entry})
+        others = tuple(name for name in scene.outputs if name not in behind)
+        cut, own = backward_slice(scene, scene.outputs, {entry: types[entry]}), backward_slice(scene, (entry,), {})
+        read = {n: type_ for n, type_ in cut.inputs.items() if n not in {entry, *own.inputs}}
+        read |= backward_slice(scene, others, {}).inputs
+        beside = [name for name, type_ in read.items() if type_.dtype.startswith("float")]
+        whole = [node for node in scene.nodes if node.name not in stream.axes]
+        before = sum(node_flops(node, types) for node in whole if node.name not in behind)
+        if tokens < LEAST_TOKENS:
+            told = f"%{entry} has {tokens} tokens, fewer than {LEAST_TOKENS}"
+        elif beside:
+            told = f"what it gives depends on %{beside[0]} otherwise than by %{entry}"
+        elif before > MOST_WHOLE * total:
+            told = f"what makes %{entry} is {before / total:.0%} of its FLOPs"
+        elif sum(node_flops(node, types) for node in whole) > MOST_WHOLE * total:
+            where = next(node for node in whole if stream.axes.keys() & set(node.refs()))
+            told = f"at %{where.name} ({where.op}) tokens come together otherwise than by attention"
+        else:
+            return stream
+    return told
+
+
+def words_of(sequence: Graph, weights: Weights) -> tuple[int, ...]:
+    """The rows of what a graph gives, ``[B, 1, T, D]``, that no picture changes; found on numbers."""
+    run, rng = evaluator(sequence, weights), np.random.default_rng(0)
+    given = {name: drawn(type_, 1, rng) for name, type_ in sequence.inputs.items()}
+    others = {name: drawn(type_, 1, rng) for name, type_ in sequence.inputs.items() if given[name].is_floating_point()}
+    with torch.no_grad():
+        one, other = run(given)[0], run({**given, **others})[0]
+    return tuple((one == other).all(-1).flatten().nonzero().ravel().tolist())
+
+
+def read_whole(node: Node, axes: Mapping[str, int]) -> tuple[int, ...]:
+    """The places of the arguments of a node of which each token reads all rows, as of keys and values."""
+    if node.op == ATTENTION:
+        return (1, 2)
+    second = node.args[1] if node.op in _PRODUCTS else None  # attention may be written out
+    return (1,) if isinstance(second, Ref) and second.name in axes else ()
+
+
 def _not_patches(node: Node, types: Mapping[str, TensorType]) -> str | None:
     """Why a convolution does not see each pixel once at most; None if it does."""
     defaults: tuple[Argument, ...] = (None, (1, 1), (0, 0), (1, 1), 1)
@@ -127,11 +178,11 @@ def _patches_of(tower: Graph, pixels: str, entry: str, weights: Weights) -> list
         """Which rows change with these patches."""
         after, mask = before.clone(), which.repeat_interleave(kernel[0], 0).repeat_interleave(kernel[1], 1)
         part = after[..., : mask.shape[0], : mask.shape[1]]
-        part[..., mask] = part[..., mask] + 1.0 + torch.rand(part[..., mask].shape, generator=drawn)
+        part[..., mask] = part[..., mask] + 1.0 + torch.rand(part[..., mask].shape, generator=random)
         with torch.no_grad():
             return (run({pixels: after})[0] != run({pixels: before})[0]).any(-1)[0]
 
-    drawn = torch.Generator().manual_seed(0)
+    random = torch.Generator().manual_seed(0)
     found = torch.zeros(types[entry].at(1)[1], dtype=torch.int64)
     several, ever = torch.zeros_like(found, dtype=torch.bool), changed(torch.ones_like(numbers, dtype=torch.bool))
     for bit in range(max(1, (rows * columns - 1).bit_length())):
@@ -159,16 +210,21 @@ def _axis_after(node: Node, read: list[str], axes: Mapping[str, int], types: Map
     """The axis of tokens in what a node gives; None if it brings tokens together, or nobody knows."""
     result = node.type.shape
     if node.op == ATTENTION:
-        # A mask is the same for every picture: nothing that it is made of is read.
+        # A mask does not depend on what tokens hold: nothing that it is made of is read.
         plain = len(read) == 3 and all(value in (None, 0.0, False) for value in node.args[4:])
         inner = all(axes[name] == len(types[name].shape) - 2 for name in read)
         known = {name for name, _ in node.kwargs} <= {"scale"}
         return len(result) - 2 if plain and inner and known else None
+    if read_whole(node, axes):  # a row for each row of the first factor, whatever the second one is
+        first = next(iter(node.refs()))
+        return axes[first] if axes.get(first) == len(types[first].shape) - 2 else None
     behind = {len(types[name].shape) - axes[name] for name in read}
     if operation(node.op).elementwise:
         return len(result) - behind.pop() if len(behind) == 1 else None
     if node.op == _CAT:  # of channels, as where the halves of rotated queries are put beside each other
         axis = axes[read[0]]
         return axis if joined_axis(node) != axis and len(behind) == 1 and read == list(node.refs()) else None
+    if operation(node.op).movement is Movement.REPEAT:  # not along the axis: there would be more tokens
+        return len(result) - behind.pop()
     # The token's own row is to be the first factor, and nothing else.
     return axis_after(node, axes[read[0]], types) if read == list(node.refs())[:1] else None

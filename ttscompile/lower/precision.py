@@ -24,7 +24,7 @@ from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, columns_at_once, pack
 from ..core.spec import FP32, INT4, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
-from ..ir.pieces import BLOCKS, CONDITION, NOT_KEPT, OF_ALL_BLOCKS, SCENE, STEP, frame_name, is_tokens, part_of
+from ..ir.pieces import BLOCKS, CONDITION, OF_ALL_BLOCKS, SCENE, STEP, frame_name, is_tokens, part_of, renewed_name
 from .graph_writer import GraphWriter
 from .integer_attention import HEADS, integer_attention
 from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, NO_ZERO, integer_convolution, shapes_of
@@ -116,7 +116,9 @@ def lower_precision(
             # What some tokens are computed in is what all of them are: decided for all.
             size = 1
             if is_tokens(name):  # as many as rows are kept
-                kept = next(value for value in models[name].graph.input if value.name not in NOT_KEPT)
+                graph = models[name].graph
+                renewed = {value.name for value in graph.output}
+                kept = next(value for value in graph.input if renewed_name(value.name) in renewed)
                 size = int(kept.type.tensor_type.shape.dim[0].dim_value)
             least, bits = 0 if part == BLOCKS else LEAST_ROWS, precision if part in FOUR_BITS else INT8
             model, own = quantize_model(models[name], weights, least, size, bits, constants)

@@ -173,7 +173,7 @@ def _episode(course: Course) -> Section:
     drawn, work = list[Picture](), course.frames
     if course.seen:
         caption = (
-            f"{work.tokens} of {work.of} tokens of the image encoders were computed, {share(work.tokens / work.of)};"
+            f"{work.tokens} of {work.of} tokens of new frames and scenes were computed, {share(work.tokens / work.of)};"
             f" {work.forward} took the rows of a computed one, and the others kept their own. A row is a camera. In"
             " colour: patches whose tokens were computed in this call. Pale and framed: those that took rows. They were"
             " computed since the frame is the first, or one that is refreshed whole, or since patches changed."

@@ -15,6 +15,7 @@ from ..core.plan import DENSE, SCHEDULE
 from ..core.poses import NUMBERS
 from ..core.spec import ObservationSpec, SamplerTable
 from ..ir.flops import frames_flops, graph_flops, once_flops
+from ..ir.pieces import SCENE
 from ..ir.program import Binding
 from ..measure.machine import elsewhere
 from ..measure.timer import MANY
@@ -95,15 +96,20 @@ def told_sampler(table: SamplerTable) -> str:
 
 
 def tokens(manifest: Manifest) -> list[tuple[str, str]]:
-    """Of each image encoder that has tokens, which plans reuse them."""
-    reusing = [
-        f"{name} computes a token anew where its patch differs by more than {one.tokens.threshold:g}, and one frame of"
-        f" {one.tokens.refresh} whole"
-        for name, one in manifest.plans.items()
-        if one.tokens is not None
-    ]
-    told = "; ".join(reusing) or "every plan computes all of them"
-    return [(f"tokens of {name}", f"{one.tokens} a frame; {told}") for name, one in manifest.tokens.items()]
+    """Of each image encoder, and the scene, that has tokens, which plans reuse them."""
+    plans = [(name, plan.tokens) for name, plan in manifest.plans.items() if plan.tokens is not None]
+    found = []
+    for piece, record in manifest.tokens.items():
+        of, what = ("scene", "row") if piece == SCENE else ("frame", "patch")
+        reusing = [
+            f"{name} computes a token anew where its {what} differs by more than"
+            f" {one.threshold if of == 'frame' else one.scene:g}, and one {of} of {one.refresh} whole"
+            for name, one in plans
+            if of == "frame" or one.scene is not None
+        ]
+        told = "; ".join(reusing) or "every plan computes all of them"
+        found.append((f"tokens of {piece}", f"{record.tokens} a {of}; {told}"))
+    return found
 
 
 def precision(manifest: Manifest) -> str:

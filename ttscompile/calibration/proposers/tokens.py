@@ -1,4 +1,4 @@
-"""When a token of an image encoder is computed anew: the setting that computes the fewest, of those that are near."""
+"""When a token of an encoder or of the scene is computed anew: the setting with the fewest, of those that are near."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -8,6 +8,7 @@ import numpy as np
 from ...artifact.load import Artifact
 from ...core.plan import Plan, TokenReuse
 from ...errors import CalibrationFailedError
+from ...ir.pieces import SCENE
 from ...measure.points import ALIKE
 from ..clock import Clock
 from ..judge import Score, further, judge, timed
@@ -16,6 +17,8 @@ from ..trials import LEARNED, Trials
 
 THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Differences that are tried, ascending. Encoders read pixels with a deviation of about one."""
+SCENES = (0.4, 0.2, 0.1, 0.05)
+"""Shares of a scene's rows that are tried, descending: words are computed anyway, so most of these change little."""
 REFRESHES = (32, 16, 12, 8, 4)
 """Of so many new frames one is whole; never of more than follow each other where plans are judged."""
 MOST_COMPUTED = 0.75
@@ -33,44 +36,58 @@ class Tokens(Proposer):
     """Of what other noise changes."""
 
     def applies(self, artifact: Artifact) -> str | None:
-        """Whether an encoder has tokens."""
+        """Whether an encoder, or the scene, has tokens."""
         if artifact.manifest.tokens:
             return None
-        problem = "no image encoder of this policy is a vision transformer, whose tokens could be reused"
+        problem = "no image encoder of this policy is a vision transformer, whose tokens could be reused, nor its scene"
         return f"{problem}; 'ttscompile convert --explain' says of each encoder why"
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """The plan, with the setting that computes the fewest tokens."""
         seen = max(last - first + 1 for _, first, last in trials.learned.stretches.tolist())
         refreshes = sorted({min(refresh, seen) for refresh in REFRESHES}, reverse=True)
-        settings = [TokenReuse(threshold, refresh) for refresh in refreshes for threshold in THRESHOLDS]
+        own = trials.artifact.manifest.tokens
+        thresholds = THRESHOLDS if set(own) - {SCENE} else THRESHOLDS[:1]
+        settings = [TokenReuse(threshold, refresh) for refresh in refreshes for threshold in thresholds]
+        settings = settings if thresholds is THRESHOLDS else settings[:1]  # of whole frames none is a refresh
+        scenes = SCENES if SCENE in own else ()
         all_tokens = replace(plan, tokens=None)
         if self.request.by_time:
-            self._require_faster(trials, all_tokens, replace(plan, tokens=TokenReuse(THRESHOLDS[-1], refreshes[0])))
-        whole, tried = judge(trials, all_tokens, LEARNED), list[tuple[float, Score, Plan]]()
-        trials.bar.stage("settings of tokens", len(settings))
+            fewest = TokenReuse(thresholds[-1], refreshes[0], *scenes[:1])
+            self._require_faster(trials, all_tokens, replace(plan, tokens=fewest))
+        whole, tried = judge(trials, all_tokens, LEARNED), list[tuple[float, Score, TokenReuse]]()
+        trials.bar.stage("settings of tokens", len(settings) + len(scenes))
         too_far = dict[int, float]()
-        for number, setting in enumerate(clock.in_time(settings), 1):
+
+        def try_one(setting: TokenReuse) -> tuple[float, float]:
+            """By how much further off the actions are, and at most."""
+            score = judge(trials, replace(plan, tokens=setting), LEARNED)
+            off, limit = further(score, whole)
+            tried.append((limit, score, setting))
+            trials.bar.update(len(tried), f"{score.tokens:.0%} computed", clock.left())
+            return off, limit
+
+        for setting in clock.in_time(settings):
             if setting.threshold > too_far.get(setting.refresh, np.inf):
                 continue  # a larger threshold changes more
-            one = replace(plan, tokens=setting)
-            score = judge(trials, one, LEARNED)
-            off, limit = further(score, whole)
-            tried.append((limit, score, one))
-            if off > self.margin:
+            if try_one(setting)[0] > self.margin:
                 too_far[setting.refresh] = setting.threshold
-            trials.bar.update(number, f"{score.tokens:.0%} computed", clock.left())
-        good = [(score, one) for limit, score, one in tried if limit <= self.margin]
+        good = [(score, setting) for limit, score, setting in tried if limit <= self.margin]
         if not good:
             least = min(limit for limit, _, _ in tried)
             raise _refused(f"the actions are {least:.3g} further off at least, and {self.margin:g} is allowed")
         score, best = min(good, key=lambda one: one[0].tokens)  # of equals the smallest threshold, the rarest refresh
+        for share in clock.in_time(scenes):  # of the rows that encoders give so
+            if try_one(replace(best, scene=share))[1] <= self.margin:
+                _, score, best = tried[-1]
+                break
         if (told := _too_many(score, {})) is not None:
             raise _refused(f"it {told}")
-        assert best.tokens is not None
-        self.told = f"on the calls that it was chosen on, {score.tokens:.0%} of the tokens of new frames are computed"
-        notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
-        yield Proposal(trials.changed_name, best, notes, margin=self.margin, shared=shared, refusal=_too_many)
+        of = "new frames" + " and scenes" * (best.scene is not None)
+        self.told = f"on the calls that it was chosen on, {score.tokens:.0%} of the tokens of {of} are computed"
+        notes, made = {**asdict(best), "computed": score.tokens}, replace(plan, tokens=best)
+        shared = {"tokens": best}
+        yield Proposal(trials.changed_name, made, notes, margin=self.margin, shared=shared, refusal=_too_many)
 
     def _require_faster(self, trials: Trials, all_tokens: Plan, fewest: Plan) -> None:
         """Raise unless a plan with the fewest tokens may be chosen for its time, as that of a small encoder may not.
