@@ -48,7 +48,7 @@ LATER_NAMES = frozenset("TokenCalibration WarmCalibration distill reuse_tokens t
 """What 4c23ea8e had beside these."""
 
 USES = frozenset(
-    "load(precision=) load(reuse_tokens=) load(warm=) PolicyInfo.warm_steps PolicySpec.original"
+    "calibrate(strategy=) load(precision=) load(reuse_tokens=) load(warm=) PolicyInfo.warm_steps PolicySpec.original"
     " SamplerTable.without_skip".split()
 )
 """Arguments and attributes of the names that are there still, which are gone."""

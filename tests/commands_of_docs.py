@@ -9,7 +9,7 @@ NOT_RUN = {
     "source": "of the shell, and for what make would have set up",
     "cd": "of the shell",
     "python examples/benchmark/sweep.py": "takes 20 minutes; tests/examples/test_benchmark_sweep.py runs it in short",
-    "python examples/benchmark/strategies.py": "tests/examples/test_benchmark_strategies.py runs it in short",
+    "python examples/benchmark/rivals.py": "tests/examples/test_benchmark_rivals.py runs it in short",
     "python examples/ablation/oracle.py": "tests/examples/test_ablation_oracle.py runs it in short",
     "python examples/benchmark/gpu.py": "needs a GPU; tests/examples/test_benchmark_gpu.py runs it on the CPU",
     "pytest tests/runtimes/test_cuda.py": "needs a GPU",

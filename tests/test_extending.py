@@ -16,7 +16,7 @@ import pytest
 from tests.calibration import policies, tasks
 from tests.once import Once
 from tests.pages import EXTENDING, ROOT, examples, load
-from ttscompile.calibration import proposer, sparse_loop, strategies
+from ttscompile.calibration import proposers, sparse_loop
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.frontends import families
 from ttscompile.frontends.settings import Settings
@@ -73,11 +73,11 @@ def test_the_policy_family(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.slow
-def test_the_strategy(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rival(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The module, its row and its test as they stand in the guide."""
-    written, row, its_test = guide("strategy")
+    written, row, its_test = guide("rival")
     contributed(written, "ttscompile.rivals.ends", tmp_path, monkeypatch)
-    monkeypatch.setattr(strategies, "STRATEGIES", (*strategies.STRATEGIES, eval(row, vars(strategies))))
+    monkeypatch.setattr(proposers, "PROPOSERS", (eval(row, vars(proposers)), *proposers.PROPOSERS))
     test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
     make_task = partial(tasks.make_task, policies.compiled(once), policies.record(tmp_path / "calls.npz"))
     test.test_whole_steps_are_at_both_ends_where_the_calls_want_them(make_task)
@@ -90,9 +90,7 @@ def test_the_proposer(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     """The module, its row and its test as they stand in the guide."""
     written, row, its_test = guide("proposer")
     contributed(written, "ttscompile.calibration.proposers.fewer", tmp_path, monkeypatch)
-    rows = (*proposer.PROPOSERS, eval(row, vars(proposer)))
-    monkeypatch.setattr(proposer, "PROPOSERS", rows)
-    monkeypatch.setattr(proposer, "NAMES", tuple(one.name for one in rows))
+    monkeypatch.setattr(proposers, "PROPOSERS", (*proposers.PROPOSERS, eval(row, vars(proposers))))
     test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
     directory = shutil.copytree(policies.compiled(once), tmp_path / "compiled")
     recording = policies.record(tmp_path / "calls.npz")
@@ -162,7 +160,7 @@ def test_the_runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     test.test_the_pruners_plan_and_reuse_over_calls(tmp_path / "pruned")
 
 
-MOST_FILES = {"pass": 2, "family": 3, "proposer": 2, "strategy": 2, "loop": 2, "term": 3, "runtime": 3}
+MOST_FILES = {"pass": 2, "family": 3, "proposer": 2, "rival": 2, "loop": 2, "term": 3, "runtime": 3}
 """That a contributor changes beside tests and docs, where no package of its own is needed."""
 
 

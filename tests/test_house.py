@@ -55,9 +55,9 @@ MAY_IMPORT = {
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
 
 RIVALS_READ = {
-    f"ttscompile.calibration.{name}" for name in ("calls", "pruner.paper", "runner", "step_counts", "strategy", "task")
+    f"ttscompile.calibration.{name}" for name in ("calls", "proposer", "pruner.paper", "runner", "step_counts", "task")
 }
-"""What rivals know of calibration: what a strategy is given, what it may compare, and how a head is trained."""
+"""What rivals know of calibration: their rows, what a search is given and may compare, and how a head is trained."""
 
 MOST_DOORS = 12
 """Other rooms that a room may import: a reader who opens more of them at once is lost."""

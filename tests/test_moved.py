@@ -28,7 +28,7 @@ COMMANDS, OPTIONS, PYTHON = (
 )
 SERVING = {"ServerLimits": ServerLimits, "FleetSettings": FleetSettings, "FleetServer": FleetServer}
 CHANGED = {("--observation", "inspect"), ("--calls", "compare"), ("--max-distance", "warm-start")}
-CHANGED |= {("--max-action-error", "reuse-tokens"), ("--precision", "convert"), ("--strategy", "calibrate")}
+CHANGED |= {("--max-action-error", "reuse-tokens"), ("--precision", "convert")}
 CHANGED |= {("--seed", "compare"), ("--plan", "distill"), ("--calls", "reuse-tokens"), ("--calls", "warm-start")}
 """What has a row although an option of that name is there: it means something else, or takes fewer words."""
 

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from tests.pages import ROOT, there
-from ttscompile.calibration.strategies import NAMES, STRATEGIES
+from ttscompile.calibration.proposers import PROPOSERS, SCHEDULES
 from ttscompile.frontends.families import FAMILIES
 from ttscompile.policies.lerobot.family import TYPES
 
@@ -29,17 +29,17 @@ def test_a_row_has_a_test_or_says_that_nothing_is_built(row: list[str]) -> None:
     tests = named(" | ".join(row), r"(tests/\S+::test_\w+)")
     assert len(tests) == (not any(cell.startswith("nothing: ") for cell in row)), row
     assert all(map(there, tests)), tests
-    assert named(" | ".join(row), r"--strategy ([\w-]+)") <= set(NAMES)
+    assert named(" | ".join(row), r"--learn ([\w-]+)") <= {one.name for one in PROPOSERS}
     scripts = re.findall(r"`(examples/[^`\s]+\.py)", " | ".join(row))
     assert all((ROOT / script).is_file() for script in scripts), scripts
 
 
-def test_every_strategy_and_what_it_is_from_has_a_row() -> None:
-    found = {name: row for row in ROWS for name in named(" | ".join(row), r"--strategy ([\w-]+)")}
-    assert set(NAMES) <= set(found)
-    for one in STRATEGIES:
-        numbers = set(re.findall(r"\d{4}\.\d{5}", one.source))
-        rows = " ".join(" | ".join(row) for row in ROWS if f"--strategy {one.name}`" in " | ".join(row))
+def test_every_proposer_of_schedules_and_what_it_is_from_has_a_row() -> None:
+    found = {name: row for row in ROWS for name in named(" | ".join(row), r"--learn ([\w-]+)")}
+    for one in SCHEDULES:
+        assert one.name in found
+        numbers = set(re.findall(r"\d{4}\.\d{5}", one.what))
+        rows = " ".join(" | ".join(row) for row in ROWS if f"--learn {one.name}`" in " | ".join(row))
         assert all(number in rows for number in numbers), f"{one.name}: {numbers}"
 
 
@@ -63,9 +63,9 @@ def test_the_works_that_the_paper_is_known_to_cite_are_counted() -> None:
 
 def test_what_is_missing_is_found() -> None:
     assert len(ROWS) > 65
-    assert named("`--strategy bac`, `examples/a/b.py`", r"--strategy ([\w-]+)") == {"bac"}
+    assert named("`--learn bac`, `examples/a/b.py`", r"--learn ([\w-]+)") == {"bac"}
     assert not there("tests/test_references.py::test_of_nothing")
     with pytest.raises(AssertionError):
-        test_a_row_has_a_test_or_says_that_nothing_is_built(["A work", "a strategy", "`--strategy bac`", ""])
+        test_a_row_has_a_test_or_says_that_nothing_is_built(["A work", "a rival", "`--learn bac`", ""])
     with pytest.raises(AssertionError):
-        test_a_row_has_a_test_or_says_that_nothing_is_built(["A work", "nothing: so", "`--strategy magic`", ""])
+        test_a_row_has_a_test_or_says_that_nothing_is_built(["A work", "nothing: so", "`--learn magic`", ""])

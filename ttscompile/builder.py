@@ -15,7 +15,8 @@ from .calibration.arguments import require_rate
 from .calibration.budget import SPARSITY, Goal
 from .calibration.calls import load_episodes
 from .calibration.pipeline import CalibrationResult, calibrate
-from .calibration.proposer import LOOPS, Request, rows_of
+from .calibration.proposer import Request
+from .calibration.proposers import LOOPS, rows_of
 from .calibration.state import FILE as STATE
 from .core.spec import INT8, PolicySpec
 from .driver import Explain, convert

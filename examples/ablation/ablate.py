@@ -228,7 +228,7 @@ def keep(found: Found, directory: Path) -> None:
     if found.pruner is not None:
         plans["mean"] = replace(base, cells=found.schedule)
         plans["found"] = replace(base, cells=None, correction=found.pruner_correction)
-    notes = {"strategy": "ablation", **found.notes}
+    notes = {"learned": ["ablation"], **found.notes}
     update_plans(directory, plans, "found", notes, pruner_weights=found.pruner, pruner_loop=base.loop)
 
 

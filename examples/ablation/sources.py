@@ -8,7 +8,7 @@ episodes that nothing was learned from, with as many computed cells as evenly sp
 written, and no runtime knows of any.
 
 - ``forecast``: ``r[o] + w (r[o] - r[p])`` of each block, and with the second difference; of the network's output it is
-  a correction, which a plan may have (strategy ``taylorseer``).
+  a correction, which a plan may have (the rival ``taylorseer``).
 - ``linear``: ``A h + c`` of the block's input h, fitted by least squares to dense calls. It is not free: a product of
   the width with itself for each token. The last column counts it.
 - ``gate``: FastCache's. A block is computed where its input has changed by more than a threshold since it last was,

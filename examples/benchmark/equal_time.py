@@ -1,4 +1,4 @@
-"""Budgets at equal milliseconds: how many cells a strategy may compute whose calls take as long as others'.
+"""Budgets at equal milliseconds: how many cells a proposer may compute whose calls take as long as others'.
 
 A cell costs more where a step has few of them: five whole steps are faster than as many cells that are spread over a
 hundred steps. So plans of as many cells do not take the same time. Here every plan takes its turn with one of evenly

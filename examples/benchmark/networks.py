@@ -137,4 +137,4 @@ def store_plans(directory: Path, plans: Mapping[str, PlanArray]) -> None:
     """Give an artifact plans with these cells, in its default's loop and precision; the last of them is the default."""
     artifact = load_artifact(directory)
     made = {name: replace(artifact.default, cells=cells) for name, cells in plans.items()}
-    update_plans(directory, {**artifact.plans, **made}, list(plans)[-1], {"strategy": "benchmark"})
+    update_plans(directory, {**artifact.plans, **made}, list(plans)[-1], {"learned": ["benchmark"]})

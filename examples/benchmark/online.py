@@ -4,7 +4,7 @@
 
 A criterion (TeaCache, DBCache) is fitted to recorded calls for each share of reused cells. Then it answers held-out
 calls twice: it decides at each step what to compute (``ttscompile.rivals.deciding``), and as the one plan that
-calibration freezes it into. Beside these stand what other strategies find for the same shares, and the plans of the
+calibration freezes it into. Beside these stand what other proposers find for the same shares, and the plans of the
 artifact. All take turns on one thread of onnxruntime, so that errors can be compared at equal milliseconds. Errors are
 against the same loop with every step computed, and the same noise. Nothing is written.
 """
@@ -22,8 +22,8 @@ import click
 import numpy as np
 import numpy.typing as npt
 import torch
+from rivals import default_sparsities
 from searches import plan_of
-from strategies import default_sparsities
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
@@ -38,8 +38,8 @@ from ttscompile.calibration.calls import (
     split_episodes,
 )
 from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.proposers import SCHEDULES
 from ttscompile.calibration.runner import Runner
-from ttscompile.calibration.strategies import NAMES
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import base_of
@@ -74,7 +74,7 @@ class Row:
     """One way to answer a call.
 
     Attributes:
-        name: of the strategy and the share of reused cells, or of the artifact's plan.
+        name: of the proposer and the share of reused cells, or of the artifact's plan.
         decides: ``online``, ``frozen``, or nothing where there is nothing to decide.
         cells: computed in a call, mean and most.
         error: mean absolute difference of the executed actions from the original's, in their units.
@@ -129,7 +129,7 @@ class Contestants:
         return answer
 
     def add_found(self, name: str, found: Found) -> None:
-        """What a strategy found; its criterion, too, if it has one."""
+        """What a search found; its criterion, too, if it has one."""
         criterion = found.notes.get("criterion")
         plan = replace(self._base, cells=found.schedule, correction=found.correction, repair=True)
         self.add_plan(name, "frozen" if criterion else "", plan)
@@ -176,7 +176,10 @@ def measured(contestants: Contestants, spec: PolicySpec, judged: Judged, rounds:
 @click.argument("directory", type=click.Path(exists=True, path_type=Path))
 @trajectories_options()
 @names_option(
-    "--strategies", NAMES, default="teacache,dbcache,taylorseer,interval,tts", help="Have each of these find plans."
+    "--learn",
+    [row.name for row in SCHEDULES],
+    default="teacache,dbcache,taylorseer,interval,schedule",
+    help="Have each of these propose schedules.",
 )
 @click.option("--sparsities", help="Shares of reused cells, such as 0.8,0.9.")
 @count_option("--calls", "Judge on so many held-out calls, at most.", default=128)
@@ -189,7 +192,7 @@ def main(
     directory: Path,
     trajectories: tuple[Path, ...],
     sources: Sources,
-    strategies: tuple[str, ...],
+    learn: tuple[str, ...],
     sparsities: str | None,
     calls: int,
     learned_calls: int,
@@ -222,7 +225,7 @@ def main(
         left_out = []
         for share in asked:
             cells = cells_of(goal_of(target_sparsity=share), manifest, False)
-            for name in strategies:
+            for name in learn:
                 bar.stage(f"{name} {share:g}", 1, 0)
                 try:
                     found, _ = plan_of(name, replace(task, budget=cells, pruner={}), seconds=60 * max_minutes)

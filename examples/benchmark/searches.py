@@ -1,4 +1,4 @@
-"""Plans that strategies find now, to take part in a comparison; what was found is kept, so that it can go on."""
+"""Schedules that are proposed now, to take part in a comparison; what was found is kept, so that it can go on."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ttscompile.calibration.calls import Calls, digest_of
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.compare import Entrant, Joining
 from ttscompile.calibration.progress import Progress
+from ttscompile.calibration.proposer import ScheduleRow
+from ttscompile.calibration.proposers import SCHEDULES
 from ttscompile.calibration.runner import Runner
-from ttscompile.calibration.schedule import open_search, search_plan
+from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.state import StateFile
-from ttscompile.calibration.strategies import strategy_of
-from ttscompile.calibration.strategy import Strategy
 from ttscompile.calibration.targets import runner_arguments, runner_elsewhere
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import HELD_OUT, Trials
@@ -32,13 +32,13 @@ from ttscompile.errors import CalibrationError
 from ttscompile.pool import Work, opened_pool
 
 LEARNED = 256
-"""Calls that strategies learn from, at most. ``calibrate`` takes more: its corrections are better."""
+"""Calls that searches learn from, at most. ``calibrate`` takes more: its corrections are better."""
 
 Outcome = dict[str, tuple[Found, bool] | str]
 """By series: what was found and whether the time cut that short, or why there is nothing."""
 
 Wish = tuple[str, int]
-"""A strategy, and how many cells its plan may compute."""
+"""A proposer, and how many cells its plan may compute."""
 
 How = tuple[int | None, float, bool]
 """Intervals at most, seconds of a search, and whether its plan takes part with a correction too."""
@@ -90,9 +90,9 @@ class Searches:
                 raise ValueError("expected searches by name")
             self.shares: dict[str, float] = state.progress.setdefault("shares", {})
 
-    def known(self, strategy: str, cells: int) -> Outcome | None:
+    def known(self, name: str, cells: int) -> Outcome | None:
         """What a search found before; None if it was not done."""
-        key, outcome = f"{strategy} {cells}", Outcome()
+        key, outcome = f"{name} {cells}", Outcome()
         with self._state.reading():
             told = self._told.get(key)
             if told is None:
@@ -114,9 +114,9 @@ class Searches:
         """The same, of a search that was done."""
         return self.known(*wish) or {}
 
-    def keep(self, strategy: str, cells: int, outcome: Outcome) -> None:
+    def keep(self, name: str, cells: int, outcome: Outcome) -> None:
         """Keep what a search found."""
-        key, told = f"{strategy} {cells}", dict[str, Any]()
+        key, told = f"{name} {cells}", dict[str, Any]()
         for series, one in outcome.items():
             if isinstance(one, str):
                 told[series] = one
@@ -134,33 +134,33 @@ class Searches:
 
 
 class Searching:
-    """Has each strategy find a plan for each sparsity, and lets these take part: see ``calibration.compare.Joining``.
+    """Has each proposer find a plan for each sparsity, and lets these take part: see ``calibration.compare.Joining``.
 
     Attributes:
-        plans: those that took part, by ``STRATEGY-SHARE``, or ``STRATEGY-corrected-SHARE``.
+        plans: those that took part, by ``NAME-SHARE``, or ``NAME-corrected-SHARE``.
         shares: of its pace that each of them takes, by series and pace; empty where they keep none.
 
     Args:
         path: the artifact; what is done is kept in its directory until ``forget``.
-        strategies: names.
+        learn: names of those that find plans; of ``SCHEDULES``.
         sparsities: shares of the cells to reuse.
-        learned: calls that strategies learn from, at most.
-        intervals: of a search, at most; None for the strategy's own number.
-        max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
+        learned: calls that searches learn from, at most.
+        intervals: of a search, at most; None for its own number.
+        max_minutes: of a search, about: what it has found by then takes part, and a warning says so. Who
             has no plan within the budget by then is left out.
-        paces: in place of sparsities: of each strategy the largest budget takes part whose plan keeps the pace.
-        correct: let the plans of strategies that fit no correction take part a second time, with one that is fitted to
-            them, where that is better. Their series are called ``STRATEGY, corrected``.
+        paces: in place of sparsities: of each the largest budget takes part whose plan keeps the pace.
+        correct: let the plans of those that fit no correction take part a second time, with one that is fitted to
+            them, where that is better. Their series are called ``NAME, corrected``.
         ray: address of a Ray cluster that answers the dense calls and does the searches, or ``local``, see
             ``ttscompile.calibrate``. None does everything here.
         resume: go on after the searches that an interrupted comparison had done, with the same arguments but for
-            strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
+            names, sparsities, other artifacts and held-out calls; begins anew if none was.
     """
 
     def __init__(
         self,
         path: Path,
-        strategies: Sequence[str],
+        learn: Sequence[str],
         sparsities: Sequence[float],
         *,
         learned: int = LEARNED,
@@ -172,7 +172,7 @@ class Searching:
         resume: bool = False,
     ) -> None:
         self._path, self._ray, self._resume = path, ray, resume
-        self._strategies, self._sparsities = [strategy_of(name) for name in strategies], sparsities
+        self._rows, self._sparsities = [row_of(name) for name in learn], sparsities
         self._paces = paces or (lambda trials: ())
         self._timed = paces is not None
         self._learned, self._minutes, self._how = learned, max_minutes, (intervals, 60 * max_minutes, correct)
@@ -211,15 +211,13 @@ class Searching:
                 state.remove()
             searches = Searches(state, (manifest.steps, len(manifest.blocks)))
             search = partial(self._search, trials, searches, progress)
-            wished = [
-                ((one.name, cells), f"{sparsity:g}") for one in self._strategies for sparsity, cells in budgets.items()
-            ]
+            wished = [((one.name, cells), f"{sparsity:g}") for one in self._rows for sparsity, cells in budgets.items()]
             search(dict(wished))
             trials.sample(HELD_OUT)  # answered by the pool, and kept
             found = [(series, name, one) for wish, name in wished for series, one in searches.known_of(wish).items()]
             for pace in self._paces(trials):
-                for strategy in self._strategies:
-                    for series, one, share in _at_pace(pace, strategy, searches, search):
+                for row in self._rows:
+                    for series, one, share in _at_pace(pace, row, searches, search):
                         found.append((series, pace.name, one))
                         if share is not None:
                             self.shares.setdefault(series, {})[pace.name] = share
@@ -255,16 +253,16 @@ class Searching:
         progress("search", len(names), len(names))
 
     def _remarks(self, steps: int, features: int) -> list[str]:
-        """What a reader has to know of the strategies that take part."""
+        """What a reader has to know of those that take part."""
         found = []
-        if self._strategies and not (self._sparsities or self._timed):
-            found.append(f"no strategy takes part: no share of the cells was given for K = {steps}.")
-        if pruning := [one.name for one in self._strategies if one.uses_pruner]:
+        if self._rows and not (self._sparsities or self._timed):
+            found.append(f"no proposer takes part: no share of the cells was given for K = {steps}.")
+        if pruning := [one.name for one in self._rows if one.uses_pruner]:
             found.append(
                 f"{', '.join(pruning)}: one plan for all calls takes part, of independent calls. What depends on the"
                 " observation is found by 'calibrate', after which it is among the plans of the artifact."
             )
-        fitted = [one.name for one in self._strategies if one.fits_correction]
+        fitted = [one.name for one in self._rows if one.corrects]
         if fitted and self._learned < features:
             found.append(
                 f"{', '.join(fitted)} fits corrections of {features} features from at most {self._learned} calls: its"
@@ -273,37 +271,47 @@ class Searching:
         return found
 
 
+def row_of(name: str) -> ScheduleRow:
+    """The proposer of schedules of this name. Raises CalibrationError: there is none."""
+    for row in SCHEDULES:
+        if row.name == name:
+            return row
+    raise CalibrationError(
+        f"{name!r} proposes no schedules; expected one of {', '.join(one.name for one in SCHEDULES)}."
+    )
+
+
 def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float = math.inf) -> tuple[Found, bool]:
-    """What a strategy finds, whether or not it is any better than the uniform schedule.
+    """What a search finds, whether or not it is any better than the uniform schedule.
 
     Args:
-        name: the name of the strategy.
+        name: of the proposer.
         task: see ``Task``; its clock is not used.
-        intervals: how many at most; None for the strategy's own number.
+        intervals: how many at most; None for its own number.
         seconds: after which nothing more is begun that can be left out.
 
     Returns:
         What was found, and whether the time cut the search short.
 
     Raises:
-        CalibrationError: there is no such strategy, or it cannot keep the budget.
+        CalibrationError: there is no such proposer, or it cannot keep the budget.
         CalibrationFailedError: the time was up before there was a plan within the budget.
     """
     clock = Clock(seconds)
-    found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
+    found, _, stopped = search_plan(row_of(name).search(replace(task, clock=clock)), clock, intervals)
     return found, stopped == "time limit"
 
 
 def _at_pace(
-    pace: Pace, strategy: Strategy, searches: Searches, search: Callable[[Mapping[Wish, str]], None]
+    pace: Pace, row: ScheduleRow, searches: Searches, search: Callable[[Mapping[Wish, str]], None]
 ) -> list[tuple[str, tuple[Found, bool] | str, float | None]]:
-    """Of each series of a strategy what keeps the pace with the largest budget, and its share; or why there is none."""
+    """Of each series of a proposer what keeps the pace with the largest budget, and its share; or why there is none."""
     model, base = pace.trials.runner.model, pace.trials.base
     kept: list[tuple[str, tuple[Found, bool] | str, float | None]] = []
 
     def found(series: str, cells: int) -> tuple[Found, bool] | str:
-        search({(strategy.name, cells): f"of {cells} cells"})
-        return searches.known_of((strategy.name, cells)).get(series, "it finds nothing with fewer cells.")
+        search({(row.name, cells): f"of {cells} cells"})
+        return searches.known_of((row.name, cells)).get(series, "it finds nothing with fewer cells.")
 
     def share(series: str, cells: int) -> float:
         one, key = found(series, cells), f"{pace.name} {series} {cells}"
@@ -315,13 +323,13 @@ def _at_pace(
             searches.save()
         return searches.shares[key]
 
-    search({(strategy.name, pace.cells): f"of {pace.cells} cells"})
-    for series, most in searches.known_of((strategy.name, pace.cells)).items():
+    search({(row.name, pace.cells): f"of {pace.cells} cells"})
+    for series, most in searches.known_of((row.name, pace.cells)).items():
         if isinstance(most, str):  # nor is there anything for fewer cells
             kept.append((series, most, None))
             continue
-        least = strategy.least(model.steps, model.blocks)
-        near = model.blocks // (1 if strategy.fits_correction else 2)  # it computes whole steps alone
+        least = row.least(model.steps, model.blocks)
+        near = model.blocks // (1 if row.corrects else 2)  # it computes whole steps alone
         budget, tried = largest(partial(share, series), least, pace.cells, near)
         if budget is None:
             fewest = min(tried)
@@ -333,18 +341,18 @@ def _at_pace(
 
 
 def _searched(task: Task, how: How, wish: Wish) -> Outcome:
-    """What a strategy finds for so many cells."""
-    (strategy, cells), (intervals, seconds, correct) = wish, how
+    """What a search finds for so many cells."""
+    (name, cells), (intervals, seconds, correct) = wish, how
     try:
-        found, short = plan_of(strategy, replace(task, budget=cells), intervals, seconds)
+        found, short = plan_of(name, replace(task, budget=cells), intervals, seconds)
     except CalibrationError as error:
-        return {strategy: str(error)}
-    outcome: Outcome = {strategy: (found, short)}
-    if correct and not strategy_of(strategy).fits_correction:
+        return {name: str(error)}
+    outcome: Outcome = {name: (found, short)}
+    if correct and not row_of(name).corrects:
         try:
-            outcome[f"{strategy}, corrected"] = task.corrected(found), False
+            outcome[f"{name}, corrected"] = task.corrected(found), False
         except CalibrationError as error:
-            outcome[f"{strategy}, corrected"] = str(error)
+            outcome[f"{name}, corrected"] = str(error)
     return outcome
 
 
@@ -355,7 +363,7 @@ def _searched_elsewhere(
 
 
 def _of_schedules(runner: Runner, calls: Calls, seed: int) -> Task:
-    """What strategies are given, but for the budget.
+    """What searches are given, but for the budget.
 
     Without constants of a pruner nobody spends time on plans that depend on the observation.
     """

@@ -241,7 +241,7 @@ def main(
         error = estimate(np.nanmean(action_errors(variant, seen), axis=1).tolist())
         compiled = load_artifact(folder)
         cells = compiled.default.cells
-        assert cells is not None, "the default strategy leaves the pruner alone"
+        assert cells is not None, "the default leaves the pruner alone"
         computed = tuple(np.flatnonzero((cells == ttscompile.Source.COMPUTE).any(axis=1)).tolist())
         assert one.score_difference is not None, "the dense policy is the first"
         rows.append(Varied(value, computed, took, error, one.score, one.score_difference, one.success))

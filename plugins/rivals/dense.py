@@ -1,4 +1,4 @@
-"""What several strategies look at before they decide: some calls, and what a dense call adds step by step."""
+"""What several rivals look at before they decide: some calls, and what a dense call adds step by step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Strategies of one interval: a plan from a rule, or from statistics of a few calls."""
+"""Searches of one interval: a plan from a rule, or from statistics of a few calls."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMPARED = 16
 
 
 class Fixed(NothingAfter):
-    """A strategy of one interval."""
+    """A search of one interval."""
 
     def __init__(self, task: Task, choose: Callable[[Task], Found]) -> None:
         self._task, self._choose = task, choose
@@ -57,7 +57,7 @@ class Fixed(NothingAfter):
 
 
 def fixed(choose: Callable[[Task], Found]) -> Callable[[Task], Fixed]:
-    """Make a strategy of a function that chooses a plan; a decorator."""
+    """Make a search of a function that chooses a plan; a decorator."""
     return partial(Fixed, choose=choose)
 
 

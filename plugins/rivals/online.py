@@ -1,4 +1,4 @@
-"""Strategies that choose a criterion: it looks at each step and says which blocks are worth computing.
+"""Searches for a criterion: it looks at each step and says which blocks are worth computing.
 
 A criterion is a few numbers, which the record of a calibration holds as JSON. Calibration asks it once a step, between
 two parts of the blocks; the runtimes execute one plan that it has decided, and ``deciding`` asks it in the call::
@@ -56,7 +56,7 @@ class Criterion:
     """When the blocks after the first ones are computed again.
 
     Attributes:
-        name: of the strategy that it comes from.
+        name: of the rival that it comes from.
         always: how many blocks, from the first, are computed at every step; what they add together is the feature. 0:
             the feature is the residual stream after the stem.
         threshold: the blocks are computed where the estimated change is not below this.
@@ -292,7 +292,7 @@ def proposals(task: Task) -> Sequence[tuple[Criterion, float]]:
     steps, blocks = task.runner.model.steps, task.runner.model.blocks
     if blocks < 2:
         raise CalibrationError(
-            "strategy 'dbcache' decides about the blocks after the first; the policy has one block. Take teacache."
+            "'dbcache' decides about the blocks after the first; the policy has one block. Take teacache."
         )
     found = []
     for always in FIRST:

@@ -1,6 +1,6 @@
 """Plans from a rule, without looking at residuals: ``interval``, ``delta_dit`` and ``deepcache``.
 
-- ``interval``: every block computed at evenly spaced steps: the baseline that every other strategy is held against.
+- ``interval``: every block computed at evenly spaced steps: the baseline that every other schedule is held against.
   Source: FORA (2024) and the action head of EfficientVLA (NeurIPS 2025), see ``docs/design.md`` section 7.
 - ``delta_dit``: between full steps the rear blocks are reused at first, and the front blocks later. Source: Chen et
   al., Delta-DiT: A Training-Free Acceleration Method Tailored for Diffusion Transformers, 2024 (arXiv 2406.01125). The

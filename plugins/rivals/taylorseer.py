@@ -38,7 +38,7 @@ WARMUP = (1, 2, 3)
 
 
 class TaylorSeer(Fixed):
-    """The strategy of this module."""
+    """The search of this module."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task, _best)

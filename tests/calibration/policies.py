@@ -86,7 +86,7 @@ def record(path: Path, episodes: int = 6, seed: int = 0) -> Path:
 
 def whole_steps(directory: Path, recording: Path) -> Path:
     """The artifact with a schedule that computes two of its ten steps."""
-    ttscompile.calibrate(directory, [recording], 0.8, "interval", progress=False)
+    ttscompile.calibrate(directory, [recording], 0.8, learn=("interval",), progress=False)
     return directory
 
 

@@ -10,8 +10,10 @@ import numpy as np
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, load_episodes, prepare_calls, sample_calls
+from ttscompile.calibration.proposer import ScheduleRow
+from ttscompile.calibration.proposers import rows_of
 from ttscompile.calibration.runner import Runner
-from ttscompile.calibration.schedule import open_search, search_plan
+from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import Trials
@@ -28,7 +30,7 @@ MakeTask = Callable[..., Task]
 def make_task(
     directory: Path, recording: Path, budget: int = 20, calls: int = 12, seed: int = 0, episodes: range = range(6)
 ) -> Task:
-    """A task with all that a strategy may ask for."""
+    """A task with all that a search may ask for."""
     artifact = load_artifact(directory)
     spec, runner = artifact.manifest.spec, Runner(view_of(artifact, "dense"))
     recorded = load_trajectories([recording], spec.observations, 4)
@@ -51,9 +53,16 @@ def distance(x: np.ndarray, y: np.ndarray) -> float:
     return rooted(float(h.mean()), float(apart.mean()))
 
 
+def row_of(name: str) -> ScheduleRow:
+    """Of what makes a schedule."""
+    (row,) = rows_of((name,))
+    assert isinstance(row, ScheduleRow)
+    return row
+
+
 def found_by(name: str, task: Task, intervals: int | None = None) -> Found:
-    """What a strategy finds."""
-    return search_plan(open_search(name, task), task.clock, intervals)[0]
+    """What the search of a row finds."""
+    return search_plan(row_of(name).search(task), task.clock, intervals)[0]
 
 
 def in_windows(task: Task, windows: int, window: int = WINDOW) -> Calls:

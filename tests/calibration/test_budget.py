@@ -237,6 +237,6 @@ def test_of_one_step_nothing_can_be_reused(artifact: Path, recording: Path, monk
             quick(artifact, recording, **asked)
 
 
-def test_an_error_needs_the_strategy_that_fits_corrections(artifact: Path, recording: Path) -> None:
-    with pytest.raises(CalibrationError, match="max_action_error needs strategy 'tts'; found 'bac'"):
-        quick(artifact, recording, max_action_error=1.0, strategy="bac")
+def test_an_error_needs_a_proposer_that_fits_corrections(artifact: Path, recording: Path) -> None:
+    with pytest.raises(CalibrationError, match="expected a proposer that fits corrections, 'schedule'; found 'bac'"):
+        quick(artifact, recording, max_action_error=1.0, learn=("bac",))

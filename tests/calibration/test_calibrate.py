@@ -65,7 +65,7 @@ def test_the_rate_of_training_is_kept_until_another_one_is_said(artifact: Path, 
     np.savez(said, **np.load(said), meta=np.array('{"policy_hz": 12.5}'))
 
     def learned(path: Path, **given: Any) -> float | None:
-        quick(artifact, path, strategy="interval", **given)
+        quick(artifact, path, learn=("interval",), **given)
         return ttscompile.load(artifact).info.policy_hz
 
     assert learned(silent) is None
@@ -120,7 +120,7 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
 def test_another_seed_gives_another_split(
     calibrated: tuple[Path, CalibrationResult], artifact: Path, recording: Path
 ) -> None:
-    other = quick(artifact, recording, strategy="interval", seed=3)
+    other = quick(artifact, recording, learn=("interval",), seed=3)
     assert other.episodes != calibrated[1].episodes
 
 
@@ -184,8 +184,8 @@ def test_a_state_of_other_settings_is_refused(artifact: Path, recording: Path, c
 
 def test_resuming_with_more_time_goes_on_with_the_same_calls(artifact: Path, recording: Path) -> None:
     with killed(saves=3):  # of what is judged, and of the first calls to learn from
-        quick(artifact, recording, strategy="interval", max_minutes=1e-6)
-    result = quick(artifact, recording, strategy="interval", max_minutes=2, resume=True)
+        quick(artifact, recording, learn=("interval",), max_minutes=1e-6)
+    result = quick(artifact, recording, learn=("interval",), max_minutes=2, resume=True)
     assert result.calls["calibration"] == 64
 
 
@@ -196,8 +196,8 @@ def test_the_time_limit_ends_the_search_with_the_best_plan_so_far(artifact: Path
     assert result.sparsity >= TARGET
 
 
-def test_the_interval_strategy_is_the_uniform_schedule(artifact: Path, recording: Path) -> None:
-    result = quick(artifact, recording, strategy="interval")
+def test_the_schedule_of_interval_is_the_uniform_one(artifact: Path, recording: Path) -> None:
+    result = quick(artifact, recording, learn=("interval",))
     loaded = load_artifact(artifact)
     np.testing.assert_array_equal(loaded.plans["schedule"].cells, loaded.plans["uniform"].cells)
     assert result.default_plan == "schedule"
@@ -211,7 +211,7 @@ def test_no_better_than_uniform_is_a_failure_that_changes_nothing(
 
     monkeypatch.setattr(bac, "bac", static.interval)
     with pytest.raises(CalibrationFailedError, match="no better than the uniform schedule"):
-        quick(artifact, recording, strategy="bac")
+        quick(artifact, recording, learn=("bac",))
     assert {n: c for n, c in contents(artifact).items() if n != FILE} == before
 
 
@@ -222,7 +222,7 @@ def test_a_target_out_of_reach_is_refused(artifact: Path, recording: Path, targe
 
 
 def test_the_highest_target_leaves_step_0(artifact: Path, recording: Path) -> None:
-    result = quick(artifact, recording, target_sparsity=0.9, strategy="interval")
+    result = quick(artifact, recording, target_sparsity=0.9, learn=("interval",))
     assert result.sparsity == pytest.approx(0.9)
 
 
@@ -232,12 +232,14 @@ def test_bad_settings_are_refused(artifact: Path, recording: Path, arguments: di
         quick(artifact, recording, **arguments)
 
 
-def test_an_unknown_strategy_is_refused_before_any_work(
+def test_what_cannot_be_learned_is_refused_before_any_work(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counted = _count_targets(monkeypatch)
-    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-paper"):
-        quick(artifact, recording, strategy="magic")
+    with pytest.raises(CalibrationError, match="expected some of schedule, tts-paper, .*, start; found 'magic'"):
+        quick(artifact, recording, learn=("magic",))
+    with pytest.raises(CalibrationError, match="makes the first plan; found 'schedule' and 'bac'. Take one"):
+        quick(artifact, recording, learn=("bac", "weights", "schedule"))
     assert counted() == 0
 
 
@@ -250,7 +252,7 @@ def test_two_short_episodes_are_enough(artifact: Path, tmp_path: Path) -> None:
     draw = np.random.default_rng(0)
     path = tmp_path / "short.npz"
     np.savez(path, obs=draw.standard_normal((2, 2, 3)).astype(np.float32), episode_ends=[1, 2])
-    result = quick(artifact, path, strategy="interval")
+    result = quick(artifact, path, learn=("interval",))
     assert result.calls == {"calibration": 8, "validation": 1}  # each observation with eight noises
 
 
@@ -260,9 +262,9 @@ def test_recordings_that_are_too_short_are_told_of(
     draw = np.random.default_rng(0)
     path = tmp_path / "short.npz"
     np.savez(path, obs=draw.standard_normal((9, 2, 3)).astype(np.float32), episode_ends=[2, 5, 8, 9])
-    quick(artifact, path, strategy="interval", correct=True, progress=True)
+    quick(artifact, path, learn=("interval",), correct=True, progress=True)
     assert "calls to learn from, and a correction needs 147" in capsys.readouterr().err
-    quick(artifact, path, strategy="tts-paper", max_intervals=1, progress=True)
+    quick(artifact, path, learn=("tts-paper",), max_intervals=1, progress=True)
     assert "2 of 4 episodes have fewer than 3 calls, and are left out" in capsys.readouterr().err
 
 
@@ -293,10 +295,10 @@ def test_the_split_is_by_episode(count: int, fraction: float) -> None:
         assert len(split.validation) == round(100 * fraction)
 
 
-def test_a_strategy_that_fits_corrections_is_not_asked_to(compiled: Path, recording: Path, tmp_path: Path) -> None:
+def test_who_fits_corrections_is_not_asked_to(compiled: Path, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
     before = contents(directory)
-    with pytest.raises(CalibrationError, match="strategy 'tts' fits a correction of its own. Leave correct out"):
+    with pytest.raises(CalibrationError, match="'schedule' fits a correction of its own. Leave correct out"):
         quick(directory, recording, correct=True)
     assert contents(directory) == before
 
@@ -307,7 +309,7 @@ def test_a_rival_is_corrected_on_request(compiled: Path, recording: Path, tmp_pa
     results, schedules = [], []
     for correct in (False, True):
         directory = Path(shutil.copytree(compiled, tmp_path / f"{correct}"))
-        results.append(quick(directory, recording, strategy="interval", correct=correct, max_intervals=None))
+        results.append(quick(directory, recording, learn=("interval",), correct=correct, max_intervals=None))
         artifact = load_artifact(directory)
         schedules.append(artifact.plans["schedule"].cells)
         assert ((artifact.manifest.calibration or {}).get("corrected") is True) == correct

@@ -84,7 +84,7 @@ def test_episodes_of_the_same_numbers_are_not_the_same_episodes(
     turned = {key: array if key == "episode_ends" else array[::-1] for key, array in arrays.items()}
     np.savez(tmp_path / "turned.npz", **turned)
     directory = Path(shutil.copytree(compiled, tmp_path / "own"))
-    calibrate(directory, [recording], 0.5, "interval", max_intervals=1, progress=False)
+    calibrate(directory, [recording], 0.5, learn=("interval",), max_intervals=1, progress=False)
     assert compare(directory, [recording], calls=1).warnings == ()
     (warning,) = compare(directory, [tmp_path / "turned.npz"], calls=1).warnings
     assert warning.startswith("this artifact: this comparison judges on the episodes [")

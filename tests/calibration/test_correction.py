@@ -94,7 +94,7 @@ def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: 
 
 @pytest.mark.slow
 def test_any_schedule_can_be_corrected(make_task: MakeTask, plan: PlanArray) -> None:
-    """Also one that computes single blocks, of a strategy that fits no correction itself."""
+    """Also one that computes single blocks, of a rival that fits no correction itself."""
     task, held_out = make_task(calls=400, episodes=range(4)), make_task(calls=60, episodes=range(4, 6)).calls
     single = plan.copy()
     single[1, :2] = Source.COMPUTE

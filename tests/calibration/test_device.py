@@ -61,9 +61,9 @@ def arriving(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strategy", ["tts", "bac", "sag", "teacache"])
+@pytest.mark.parametrize("name", ["schedule", "bac", "sag", "teacache"])
 def test_the_network_stays_on_its_device(
-    artifact: Path, recording: Path, arriving: list[tuple[int, ...]], strategy: str
+    artifact: Path, recording: Path, arriving: list[tuple[int, ...]], name: str
 ) -> None:
     """Corrections and a pruner, statistics of residuals, gradients, and plans that are decided in the loop.
 
@@ -71,7 +71,7 @@ def test_the_network_stays_on_its_device(
     """
     with suppress(CalibrationError):
         ttscompile.calibrate(
-            artifact, [recording], 0.5, strategy, device="meta", max_minutes=0.01, max_intervals=1, progress=False
+            artifact, [recording], 0.5, learn=(name,), device="meta", max_minutes=0.01, max_intervals=1, progress=False
         )
     assert len(arriving) > 10
 

@@ -23,11 +23,11 @@ from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.compare import compare
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.proposers import SCHEDULES
 from ttscompile.calibration.runner import Runner
-from ttscompile.calibration.schedule import open_search, search_plan
+from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
-from ttscompile.calibration.strategies import CORRECTING, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.trials import ANSWERED_BY
 from ttscompile.core.lattice import Source, uniform_plan
@@ -40,7 +40,7 @@ from ttscompile.runtimes.runtime import Runtime
 from ttscompile.trajectories import load_trajectories
 
 from . import policies
-from .tasks import MakeTask
+from .tasks import MakeTask, row_of
 
 
 class _Hand(Clock):
@@ -77,7 +77,9 @@ def test_the_search_ends_in_time_for_what_its_plan_still_takes() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "limit"), [*((name, 0) for name in NAMES), ("teacache", 1920), ("delta-dit", 960)])
+@pytest.mark.parametrize(
+    ("name", "limit"), [*((row.name, 0) for row in SCHEDULES), ("teacache", 1920), ("delta-dit", 960)]
+)
 def test_a_limit_holds_within_an_interval(
     make_task: MakeTask, name: str, limit: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,7 +95,7 @@ def test_a_limit_holds_within_an_interval(
         return block(self, b, k, stream, contexts, *streams)
 
     monkeypatch.setattr(ReferenceModel, "block", slow)
-    search = open_search(name, replace(task, clock=clock))
+    search = row_of(name).search(replace(task, clock=clock))
     if name in ("teacache", "dbcache") and limit == 0:
         with pytest.raises(CalibrationFailedError, match="time limit ended the search for a threshold of"):
             search_plan(search, clock)
@@ -101,7 +103,7 @@ def test_a_limit_holds_within_an_interval(
         found, _, stopped = search_plan(search, clock)
         assert np.count_nonzero(found.schedule == Source.COMPUTE) <= 34
         assert (stopped == "time limit") == (name not in ("interval", "deepcache"))  # which have one candidate
-    more = name in CORRECTING or strategy_of(name).uses_pruner
+    more = row_of(name).corrects or row_of(name).uses_pruner
     assert clock.now <= limit + (2 + more) * 480
 
 
@@ -146,7 +148,7 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
 
 
 def test_only_corrections_need_many_calls(artifact: Path, recording: Path) -> None:
-    result = calibrate(artifact, [recording], 0.7, "interval", progress=False, max_minutes=1e-6)
+    result = calibrate(artifact, [recording], 0.7, learn=("interval",), progress=False, max_minutes=1e-6)
     assert result.calls["calibration"] == 64
 
 
@@ -171,7 +173,7 @@ def test_a_baseline_that_diverges_is_worse_than_any_plan(
         return sample * float("nan") if fails else sample, report
 
     monkeypatch.setattr(Runtime, "predict", diverging)
-    result = calibrate(artifact, [recording], 0.55, "deepcache", progress=False, max_minutes=1e-6)
+    result = calibrate(artifact, [recording], 0.55, learn=("deepcache",), progress=False, max_minutes=1e-6)
     error = policies.errors(result)
     assert error["uniform"] == pytest.approx(LARGEST)
     assert error[result.default_plan] < 1

@@ -83,9 +83,9 @@ def test_what_cannot_be_made_is_said(artifact: Path, recording: Path) -> None:
     result = calibrate(artifact, [recording], 0.5, progress=False, max_minutes=1)
     assert result.skipped == {"safe": "would be the dense plan: twice 5 of 10 steps"}
     assert len(computed(artifact, "fast")) == 2
-    result = calibrate(artifact, [recording], 0.5, strategy="interval", progress=False, max_minutes=1)
+    result = calibrate(artifact, [recording], 0.5, learn=("interval",), progress=False, max_minutes=1)
     assert set(result.skipped) == {"safe", "fast"}
-    assert "needs a correction: strategy" in result.skipped["safe"]
+    assert "needs a correction: 'interval' fits none" in result.skipped["safe"]
     record = load_artifact(artifact).manifest.calibration
     assert record is not None
     assert record["skipped"] == dict(result.skipped)

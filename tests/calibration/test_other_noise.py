@@ -68,7 +68,6 @@ def result(other_noise: float | None) -> CalibrationResult:
 
     return CalibrationResult(
         learned=("schedule",),
-        strategy="tts",
         seed=0,
         target_sparsity=0.9,
         default_plan="schedule",

@@ -17,7 +17,8 @@ from ttscompile.calibration.judge import TIMED, WARM_UP, Score, judge, seconds_t
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.proposer import Proposal, Proposer, rows_of
+from ttscompile.calibration.proposer import Proposal, Proposer
+from ttscompile.calibration.proposers import rows_of
 from ttscompile.calibration.trials import LEARNED, Trials
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE, Plan

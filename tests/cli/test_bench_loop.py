@@ -35,7 +35,7 @@ def test_what_is_not_feasible_is_exit_status_1(toy_compiled: Path) -> None:
 def test_the_baseline_is_named_as_one(toy_compiled: Path, tmp_path: Path) -> None:
     calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
     plans = {"uniform": uniform_plan(5, 5, 1), "schedule": dense_plan(5, 5)}  # the baseline is the faster one
-    store_schedules(calibrated, None, plans, "schedule", {"strategy": "tts"})
+    store_schedules(calibrated, None, plans, "schedule", {"learned": ["schedule"]})
     options = ("--control-hz", 10, "--margin-ticks", 0, "--calls", 3, "--plan", "uniform")
     told = run("bench", calibrated, *options).stdout
     assert "uniform (baseline) " in told and "Not for a robot." in told

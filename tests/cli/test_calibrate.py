@@ -4,12 +4,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import click
 import pytest
 
 from tests.commands import refused, run
-from ttscompile.calibration.strategies import NAMES
-from ttscompile.cli import main
+from ttscompile.calibration.proposers import PROPOSERS
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 
 COMMAND = ("calibrate", "out", "--trajectories", "a.npz")
@@ -56,7 +54,6 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
         "learn": ("schedule",),
         "target_sparsity": None,
         "target_flops": None,
-        "strategy": "tts",
         "seed": 0,
         "resume": False,
         "latency_ms": None,
@@ -88,15 +85,20 @@ def test_a_plan_that_is_far_off_is_written_and_a_failed_check(monkeypatch: pytes
     assert len(result.stdout.splitlines()) < 15, "the verdict, and not all that inspect shows"
 
 
-def test_every_strategy_can_be_asked_for(asked: list[Any]) -> None:
-    (option,) = (each for each in main.commands["calibrate"].params if each.name == "strategy")
-    assert isinstance(option.type, click.Choice)
-    assert tuple(option.type.choices) == NAMES
-    for name in NAMES:
-        run(*COMMAND, "--strategy", name)
-        assert asked[-1][1]["strategy"] == name
-    assert refused(*COMMAND, "--strategy", "magic")
-    assert len(asked) == len(NAMES)
+def test_every_proposer_can_be_asked_for_and_the_help_has_its_name(asked: list[Any]) -> None:
+    told = " ".join(run("calibrate", "--help").stdout.replace("-\n", "-").split())
+    for row in PROPOSERS:
+        run(*COMMAND, "--learn", row.name)
+        assert asked[-1][1]["learn"] == (row.name,)
+        assert row.name in told.replace("- ", "-")
+    assert "schedule: which steps are computed, with corrections and jumps; loops: which loop" in told
+    assert "'magic' is not one of schedule, tts-paper, interval" in refused(*COMMAND, "--learn", "magic")
+    assert len(asked) == len(PROPOSERS)
+
+
+def test_two_that_make_the_schedule_are_refused() -> None:
+    told = "learn: expected one that makes the first plan; found 'schedule' and 'bac'. Take one of them."
+    assert refused(*COMMAND, "--learn", "bac,schedule") == f"error: {told}"
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def built(toy_compiled: Path, tmp_path: Path) -> Path:
 def made(toy: Path, folder: Path, scores: Mapping[str, Any], default: str = "schedule", **record: Any) -> Path:
     directory = shutil.copytree(toy, folder / "built")
     cells = {name: uniform_plan(5, 5, 1 + number % 4) for number, name in enumerate(scores)}
-    store_schedules(directory, None, cells, default, {"strategy": "tts", "plans": scores, **record})
+    store_schedules(directory, None, cells, default, {"learned": ["schedule"], "plans": scores, **record})
     return directory
 
 
@@ -164,7 +164,7 @@ def test_a_plan_that_becomes_fp32_is_no_longer_told_to_be_in_eight_bits(tmp_path
     directory, spec = tmp_path / "mixer", policies.spec()
     ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, directory, precision="int8")
     tried = [{"name": name, "told": "int8 in blocks"} for name in ("schedule", "safe")]
-    record = {"strategy": "tts", "plans": {"schedule": score(0.05)}, "frontier": tried}
+    record = {"learned": ["schedule"], "plans": {"schedule": score(0.05)}, "frontier": tried}
     cells = {"schedule": uniform_plan(spec.sampler.steps, 6, 2)}
     store_schedules(directory, None, cells, "schedule", record)
     assert "int8" in load_artifact(directory).default.in_words()

@@ -25,7 +25,7 @@ def scheduled(compiled_layer: Path, tmp_path_factory: pytest.TempPathFactory) ->
     """The artifact with a uniform schedule of 5 full steps as its default plan."""
     directory = tmp_path_factory.mktemp("scheduled") / "compiled"
     shutil.copytree(compiled_layer, directory)
-    store_schedules(directory, None, {"uniform": uniform_plan(100, 3, 5)}, "uniform", {"strategy": "uniform"})
+    store_schedules(directory, None, {"uniform": uniform_plan(100, 3, 5)}, "uniform", {"learned": ["uniform"]})
     return directory
 
 
@@ -37,7 +37,7 @@ def pruned(compiled_layer: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     directory = tmp_path_factory.mktemp("pruned") / "compiled"
     shutil.copytree(compiled_layer, directory)
     weights = {name: np.array(array) for name, array in load_artifact(directory).pruner.items()}
-    store_schedules(directory, weights, {}, "tts", {"strategy": "tts"})
+    store_schedules(directory, weights, {}, "tts", {"learned": ["schedule"]})
     return directory
 
 

@@ -31,7 +31,7 @@ def calibrated(toy_compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     """The same with a schedule."""
     directory = tmp_path_factory.mktemp("doctor") / "calibrated"
     shutil.copytree(toy_compiled, directory)
-    store_schedules(directory, None, {"schedule": uniform_plan(5, 5, 2)}, "schedule", {"strategy": "interval"})
+    store_schedules(directory, None, {"schedule": uniform_plan(5, 5, 2)}, "schedule", {"learned": ["interval"]})
     return directory
 
 

@@ -72,7 +72,7 @@ def calibrated(toy_compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     shutil.copytree(toy_compiled, directory)
     rollout = np.full((5, 5), Source.ROLLOUT, np.int8)
     rollout[0] = Source.COMPUTE
-    record = {"strategy": "tts", "plans": {"schedule": SCORE, "fast": {**SCORE, "error": 9.0}}, "steps": [0, 2]}
+    record = {"learned": ["schedule"], "plans": {"schedule": SCORE, "fast": {**SCORE, "error": 9.0}}, "steps": [0, 2]}
     store_schedules(directory, None, {"schedule": uniform_plan(5, 5, 2), "fast": rollout}, "schedule", record)
     return directory
 

@@ -61,7 +61,7 @@ def test_plans_that_follow_each_other_share_no_memory(toy_compiled: Path, tmp_pa
     rollout = np.full((5, 5), Source.ROLLOUT, np.int8)
     rollout[0] = Source.COMPUTE
     plans = {"a": uniform_plan(5, 5, 2), "b": uniform_plan(5, 5, 3), "c": uniform_plan(5, 5, 4), "reads": rollout}
-    store_schedules(calibrated, None, plans, "a", {"strategy": "tts"})
+    store_schedules(calibrated, None, plans, "a", {"learned": ["schedule"]})
     entered = contestants({"": load_artifact(calibrated)}, (), [Way()])
     assert [one.plan for one in entered] == ["dense", "a", "b", "c", "reads"]
     dense, a, b, c, reads = (one.policy for one in entered)

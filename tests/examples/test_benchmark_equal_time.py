@@ -11,7 +11,7 @@ import equal_time
 import pytest
 from click.testing import CliRunner
 from equal_time import SLACK, TRIES, Pace, largest
-from strategies import main
+from rivals import main
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import judge
@@ -52,7 +52,7 @@ def test_what_no_budget_keeps_is_none() -> None:
 
 
 @pytest.mark.slow
-def test_a_strategy_gets_the_cells_with_which_it_keeps_the_pace(
+def test_a_proposer_gets_the_cells_with_which_it_keeps_the_pace(
     arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As if a cell took as long as a fifth of a step of six cells takes."""
@@ -62,7 +62,7 @@ def test_a_strategy_gets_the_cells_with_which_it_keeps_the_pace(
         return float((plan.cells == Source.COMPUTE).sum() / 5 / self.steps)
 
     monkeypatch.setattr(Pace, "share", share)
-    asked = [*arguments, "--strategies", "bac,l2c", "--even-steps", "3", "--correct", "--learned-calls", "32"]
+    asked = [*arguments, "--learn", "bac,l2c", "--even-steps", "3", "--correct", "--learned-calls", "32"]
     result = CliRunner().invoke(main, [*asked, "--json", "--into", str(tmp_path / "found")])
     assert result.exit_code == 0, result.stderr
     document = json.loads(result.stdout)
@@ -86,7 +86,7 @@ def test_milliseconds_become_as_many_steps_as_they_have_room_for(
 
     monkeypatch.setattr(equal_time, "measure_budget", measured)
     monkeypatch.setattr(Pace, "share", lambda self, plan: 1.0 if self.steps == 4 else 2.0)
-    result = CliRunner().invoke(main, [*arguments, "--strategies", "interval", "--latency-ms", "7.5", "--json"])
+    result = CliRunner().invoke(main, [*arguments, "--learn", "interval", "--latency-ms", "7.5", "--json"])
     assert result.exit_code == 0, result.stderr
     (point,) = json.loads(result.stdout)["comparison"]["points"][1:]
     assert (point["name"], point["sparsity"]) == ("7.5ms", 0.6)
@@ -102,7 +102,7 @@ def test_a_plan_is_timed_beside_even_steps(arguments: list[str], monkeypatch: py
         return judge.timed(given, threads, rounds)
 
     monkeypatch.setattr(equal_time, "timed", counting)
-    asked = [*arguments, "--strategies", "interval", "--even-steps", "1", "--json"]
+    asked = [*arguments, "--learn", "interval", "--even-steps", "1", "--json"]
     result = CliRunner().invoke(main, asked)
     assert result.exit_code == 0, result.stderr
     assert timed[0] == [6, 6]

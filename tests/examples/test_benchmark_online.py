@@ -21,19 +21,19 @@ def arguments(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPath
 
 @pytest.mark.slow
 def test_a_criterion_answers_twice_and_others_once(arguments: list[str]) -> None:
-    asked = [*arguments, "--strategies", "teacache,taylorseer,dbcache"]
+    asked = [*arguments, "--learn", "teacache,taylorseer,dbcache"]
     made = CliRunner().invoke(online.main, [*asked, "--json"])
     assert made.exit_code == 0, made.output
     told = json.loads(made.stdout)
     rows = {(row["name"], row["decides"]): row for row in told["rows"]}
     assert {name for name, decides in rows if decides == "online"} == {"teacache 0.5", "teacache 0.8", "dbcache 0.5"}
     assert {name for name, decides in rows if decides == "frozen"} == {"teacache 0.5", "teacache 0.8", "dbcache 0.5"}
-    assert told["left_out"] == [one for one in told["left_out"] if one.startswith("dbcache 0.8: strategy 'dbcache'")]
+    assert told["left_out"] == [one for one in told["left_out"] if one.startswith("dbcache 0.8: 'dbcache'")]
     assert rows["every step", ""]["error"] == 0 and rows["every step", ""]["cells"] == [60.0, 60]
     assert rows["taylorseer 0.5", ""]["cells"] == [30.0, 30]
     assert rows["teacache 0.5", "online"]["cells"][0] <= rows["teacache 0.5", "online"]["cells"][1]
     times = [row["ms"] for row in told["rows"]]
     assert times == sorted(times)
-    shown = CliRunner().invoke(online.main, [*arguments, "--strategies", "interval"])
+    shown = CliRunner().invoke(online.main, [*arguments, "--learn", "interval"])
     assert "interval 0.8" in shown.stdout
     assert "6 calls of episodes that nothing was learned from" in " ".join(shown.stdout.split())

@@ -1,4 +1,4 @@
-"""Strategies that take part in a comparison: what they find, what is kept of it, and that it can go on."""
+"""Proposers that take part in a comparison: what they find, what is kept of it, and that it can go on."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def ray_pool() -> Iterator[RayPool]:
 def compare(
     path: Path,
     trajectories: Sequence[Path],
-    strategies: Sequence[str],
+    learn: Sequence[str],
     sparsities: Sequence[float],
     calls: int = 8,
     seed: int = 0,
     **options: Any,
 ) -> Comparison:
-    joining = Searching(path, strategies, sparsities, **options)
+    joining = Searching(path, learn, sparsities, **options)
     found = measure(path, trajectories, calls=calls, seed=seed, joining=joining)
     joining.forget()
     return found
@@ -52,30 +52,30 @@ def compare(
 
 @pytest.fixture(scope="module")
 def frontier(planned: Path, recording: Path) -> Comparison:
-    return compare(planned, [recording], ["interval", "tts"], [0.5, 0.8], intervals=8)
+    return compare(planned, [recording], ["interval", "schedule"], [0.5, 0.8], intervals=8)
 
 
 def points(frontier: Comparison) -> dict[tuple[str, str], MeasuredPoint]:
     return {(point.series, point.name): point for point in frontier.points}
 
 
-def test_strategies_take_part_on_the_same_calls(frontier: Comparison) -> None:
+def test_proposers_take_part_on_the_same_calls(frontier: Comparison) -> None:
     found = points(frontier)
-    assert list(found)[2:] == [("interval", "0.5"), ("interval", "0.8"), ("tts", "0.5"), ("tts", "0.8")]
+    assert list(found)[2:] == [("interval", "0.5"), ("interval", "0.8"), ("schedule", "0.5"), ("schedule", "0.8")]
     half, same = found["this artifact", "half"], found["interval", "0.5"]
     assert (half.error, half.distance) == (same.error, same.distance)  # one plan under two names
     assert half.sparsity == same.sparsity == 0.5
     assert found["interval", "0.8"].error != same.error
-    tts, interval = found["tts", "0.8"], found["interval", "0.8"]
-    assert (tts.error or 1.0) < (interval.error or 0.0)  # its correction is there
-    assert tts.distance < interval.distance
+    own, interval = found["schedule", "0.8"], found["interval", "0.8"]
+    assert (own.error or 1.0) < (interval.error or 0.0)  # its correction is there
+    assert own.distance < interval.distance
 
 
 def test_what_cannot_be_asked_for_is_refused(planned: Path, recording: Path) -> None:
-    with pytest.raises(CalibrationError, match="'magic'; expected one of tts"):
+    with pytest.raises(CalibrationError, match="'magic' proposes no schedules; expected one of schedule, tts"):
         compare(planned, [recording], ["magic"], [0.5])
     with pytest.raises(CalibrationError, match=r"at most 0\.9 of the 10 x 6"):
-        compare(planned, [recording], ["tts"], [0.95])
+        compare(planned, [recording], ["schedule"], [0.95])
 
 
 def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recording: Path) -> None:
@@ -103,14 +103,14 @@ class Gone(Exception):
 
 
 def interrupted_after(searches: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The next comparison ends when it begins another search; the strategies of all searches since."""
+    """The next comparison ends when it begins another search; the names of all searches since."""
     begun = list[str]()
 
-    def search(strategy: str, *arguments: Any) -> Any:
+    def search(name: str, *arguments: Any) -> Any:
         if len(begun) == searches:
             raise Gone
-        begun.append(strategy)
-        return plan_of(strategy, *arguments)
+        begun.append(name)
+        return plan_of(name, *arguments)
 
     monkeypatch.setattr("searches.plan_of", search)
     return begun
@@ -120,7 +120,7 @@ def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     planned: Path, frontier: Comparison, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def again(**options: Any) -> Comparison:
-        return compare(planned, [recording], ["interval", "tts"], [0.5, 0.8], calls=8, intervals=8, **options)
+        return compare(planned, [recording], ["interval", "schedule"], [0.5, 0.8], calls=8, intervals=8, **options)
 
     interrupted_after(3, monkeypatch)
     with pytest.raises(Gone):
@@ -139,7 +139,7 @@ def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     monkeypatch.setattr(Runner, "run_dense", counting)
     begun = interrupted_after(9, monkeypatch)
     found, expected = points(again(resume=True)), points(frontier)
-    assert begun == ["tts"]
+    assert begun == ["schedule"]
     assert sum(answered) == 8 * DRAWS, "what is learned from is known"
     for key, point in found.items():
         assert replace(point, latency_ms=0.0, quartiles_ms=(0.0, 0.0)) == replace(
@@ -213,11 +213,13 @@ def test_a_zipped_artifact_is_compared_and_keeps_nothing(planned: Path, recordin
 
 
 def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Path, recording: Path) -> None:
-    found = compare(planned, [recording], ["tts", "interval", "teacache"], [0.8], calls=1, learned=8, max_minutes=0)
-    assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts", "interval"]
+    found = compare(
+        planned, [recording], ["schedule", "interval", "teacache"], [0.8], calls=1, learned=8, max_minutes=0
+    )
+    assert [point.series for point in found.points] == ["this artifact"] * 2 + ["schedule", "interval"]
     assert found.skipped["teacache 0.8"].startswith("the time limit ended the search for a threshold of 'teacache'")
-    assert found.warnings[1] == "the limit of 0 minutes cut the search short of tts 0.8: see --max-minutes."
-    assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[2]
+    assert found.warnings[1] == "the limit of 0 minutes cut the search short of schedule 0.8: see --max-minutes."
+    assert "schedule fits corrections of 48 features from at most 8 calls" in found.warnings[2]
 
 
 def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path) -> None:
@@ -225,7 +227,7 @@ def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path)
     assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts-paper"]
     assert found.warnings[1].startswith("tts-paper: one plan for all calls takes part")
     found = compare(planned, [recording], ["interval"], [], calls=1)
-    assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
+    assert found.warnings[1] == "no proposer takes part: no share of the cells was given for K = 10."
 
 
 def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
@@ -236,7 +238,7 @@ def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
     def compared(pool: Elsewhere | Here, **options: Any) -> Any:
         monkeypatch.setattr("searches.opened_pool", lambda address: nullcontext(pool))
         options = {"calls": 4, "learned": 64, "intervals": 3, "ray": "an address", **options}
-        return compare(artifact, [recording], ["tts", "interval"], [0.6, 0.7], **options)
+        return compare(artifact, [recording], ["schedule", "interval"], [0.6, 0.7], **options)
 
     with pytest.raises(ClusterError, match="is gone"):
         compared(Elsewhere(3, 6))
@@ -261,7 +263,9 @@ def test_a_comparison_on_ray_finds_the_same_plans(
 
     monkeypatch.setattr("searches.opened_pool", opened)
     found = [
-        compare(artifact, [recording], ["tts", "interval"], [0.6, 0.7], calls=4, learned=64, intervals=3, ray=address)
+        compare(
+            artifact, [recording], ["schedule", "interval"], [0.6, 0.7], calls=4, learned=64, intervals=3, ray=address
+        )
         for address in (None, "an address")
     ]
     here, there = ([(p.series, p.name, p.sparsity, p.error) for p in one.points] for one in found)

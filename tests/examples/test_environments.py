@@ -250,7 +250,7 @@ def test_a_policy_of_several_tasks_is_recorded_calibrated_and_evaluated(
         }
         assert file["task"].sum(0).min() > 0
     schedule = uniform_plan(4, len(load_artifact("arm").manifest.blocks), 2)
-    store_schedules(Path("arm"), None, {"schedule": schedule}, "schedule", {"strategy": "interval"})
+    store_schedules(Path("arm"), None, {"schedule": schedule}, "schedule", {"learned": ["interval"]})
     document = json.loads(run(evaluate.main, "arm:dense", "arm", "--json", "--first-seed", "0"))
     assert document["environment"] == "fetch"
     dense, sparse = document["variants"]

@@ -80,7 +80,7 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht: Path,
     shutil.copytree(compiled_pusht, artifact)
     manifest = load_artifact(artifact).manifest
     plan = uniform_plan(manifest.steps, len(manifest.blocks), 1)
-    store_schedules(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
+    store_schedules(artifact, None, {"one": plan}, "one", {"learned": ["interval"]})
     text, told = f"{artifact}:one", []
 
     def fill() -> None:

@@ -157,7 +157,7 @@ def test_the_steps_to_a_plan_are_named_by_what_it_says() -> None:
 @pytest.mark.slow
 def test_each_step_is_timed(compiled_layer: Path, one_layer_checkpoint: Path, tmp_path: Path) -> None:
     artifact = shutil.copytree(compiled_layer, tmp_path / "compiled")
-    update_plans(artifact, {"ten": Plan(cells=uniform_plan(100, 3, 10))}, "ten", {"strategy": "interval"})
+    update_plans(artifact, {"ten": Plan(cells=uniform_plan(100, 3, 10))}, "ten", {"learned": ["interval"]})
     steps = time_steps(one_layer_checkpoint, artifact, "ten", 2)
     named = ["the original, in PyTorch", "compiled, everything computed", "10 steps computed"]
     assert [step.what for step in steps] == named
@@ -183,7 +183,7 @@ def test_episodes_that_were_run_before_are_compared(compiled_pusht: Path, tmp_pa
     artifact = shutil.copytree(compiled_pusht, tmp_path / "compiled")
     manifest = load_artifact(artifact).manifest
     shape = manifest.steps, len(manifest.blocks)
-    update_plans(artifact, {"one": Plan(cells=uniform_plan(*shape, 1))}, "one", {"strategy": "interval"})
+    update_plans(artifact, {"one": Plan(cells=uniform_plan(*shape, 1))}, "one", {"learned": ["interval"]})
     for text, coverage in ((f"{artifact}:dense", 0.8), (f"{artifact}:one", 0.7)):
         cache = Episodes(tmp_path / "episodes", "pusht", open_variant(text, "onnxruntime", 1), "onnxruntime")
         for seed in (7, 8):

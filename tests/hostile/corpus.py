@@ -46,7 +46,7 @@ def make(folder: Path) -> None:
     (folder / "states").mkdir()
     state = StateFile(folder / "states", {"model": "0" * 16, "seed": 0, "budget": {"kind": "sparsity", "value": 0.9}})
     state.progress = {"intervals": 3, "seconds": 1.5, "whole": {"4": [0, 1]}}
-    state.put("strategy", {"logits": np.zeros((3, 3, 4), np.float32), "best": np.zeros((3, 3), np.int8)})
+    state.put("search", {"logits": np.zeros((3, 3, 4), np.float32), "best": np.zeros((3, 3), np.int8)})
     state.save()
 
 

@@ -180,7 +180,7 @@ def state(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
         loaded = StateFile(folder, settings)
         if not loaded.load():
             raise CalibrationError("nothing to resume")
-        loaded.get("strategy")
+        loaded.get("search")
 
     return load
 

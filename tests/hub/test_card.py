@@ -35,6 +35,26 @@ def test_a_card_says_what_the_policy_needs_and_nothing_of_your_machine(toy_artif
     assert "the text `task`, which takes the package `tokenizers`." in with_it and "tokenizer=DIR" not in with_it
 
 
+@pytest.mark.parametrize(
+    ("record", "told"),
+    [
+        ({"learned": ["schedule"], "seed": 3}, "--seed 3`"),
+        ({"learned": ["bac", "weights"], "seed": 3}, "--seed 3 --learn bac,weights`"),
+        ({"strategy": "tts", "learned": ["schedule"], "seed": 3}, "--seed 3`"),
+        ({"strategy": "tts", "learned": ["schedule", "weights"], "seed": 3}, "--seed 3 --learn schedule,weights`"),
+        ({"strategy": "bac", "learned": ["schedule"], "seed": 3}, "--seed 3 --learn bac`"),
+        ({"strategy": "bac", "seed": 3}, "--seed 3 --learn bac`"),
+        ({"strategy": "tts", "learned": ["loops", "tokens"], "seed": 3}, "--seed 3 --learn loops,tokens`"),
+    ],
+)
+def test_a_card_shows_the_command_of_now_for_records_of_before(
+    toy_artifact: Path, record: dict[str, Any], told: str
+) -> None:
+    made = load_artifact(toy_artifact)
+    known = replace(made, manifest=replace(made.manifest, calibration=record))
+    assert f"`ttscompile calibrate DIR --trajectories CALLS {told}" in card(known, "org/name", [], [], None)
+
+
 @pytest.mark.slow
 def test_a_card_of_a_calibrated_artifact_has_its_figures(
     toy_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -43,7 +63,7 @@ def test_a_card_of_a_calibrated_artifact_has_its_figures(
     shutil.copytree(toy_artifact, calibrated)
     obs = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 2)).astype(np.float32)
     np.savez(tmp_path / "calls.npz", obs=obs, episode_ends=[10, 20, 30, 40])
-    ttscompile.calibrate(calibrated, [tmp_path / "calls.npz"], target_sparsity=0.5, strategy="interval")
+    ttscompile.calibrate(calibrated, [tmp_path / "calls.npz"], target_sparsity=0.5, learn=("interval",))
     identity = load_artifact(calibrated).manifest.identity
     figure = {"mean": 0.75, "low": 0.5, "high": 1.0}
     variant = {"identity": identity, "label": "/home/me/calibrated:x|y", "success": figure, "score": figure}
@@ -70,7 +90,7 @@ def test_a_card_of_a_calibrated_artifact_has_its_figures(
         f"{record['plans'][plan]['error']:.4g}",
         "| pusht | calibrated:x\\|y | 8 | 0.750 \\[0.500, 1.000\\] | 0.750 \\[0.500, 1.000\\] |",
         "a \\<b\\>processor\\</b\\>",
-        "--target-sparsity 0.5 --strategy interval --seed 0`",
+        "--target-sparsity 0.5 --seed 0 --learn interval`",
         f"| identity | {identity} |",
         "licence | not known: ask who trained the base",
         'policy = ttscompile.load("hf://org/name", threads=1)',

@@ -62,7 +62,7 @@ def calibrate(artifact: Path, recording: Path) -> None:
     arrays: dict[str, Any] = {key: np.concatenate([obs[key] for obs, _ in calls]) for key in calls[0][0]}
     ends = np.arange(1, EPISODES + 1) * CALLS
     np.savez(recording, episode_ends=ends, **arrays)
-    ttscompile.calibrate(artifact, [recording], 0.5, "interval", correct=True, progress=False)
+    ttscompile.calibrate(artifact, [recording], 0.5, learn=("interval",), correct=True, progress=False)
 
 
 def answers(artifact: Path, precisions: Sequence[str] = (FP32, INT8)) -> Iterator[tuple[str, npt.NDArray[Any]]]:

@@ -24,7 +24,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What ``made.py`` leaves for one policy, without blocks of eight bits: the toy has none."""
     folder = tmp_path_factory.mktemp("made") / "toy"
     artifact = written_artifact(toy_program(noise=0.0, pruner=False), folder / "artifact").path
-    store_schedules(artifact, None, {"uniform": uniform_plan(5, 5, 3)}, "uniform", {"strategy": "by hand"})
+    store_schedules(artifact, None, {"uniform": uniform_plan(5, 5, 3)}, "uniform", {"learned": ["by hand"]})
     answers: dict[str, Any] = dict(made.answers(artifact, ("fp32",)))
     np.savez(folder / "actions.npz", **answers)
     return folder

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.calibration.tasks import MakeTask, found_by
-from ttscompile.calibration.strategies import strategy_of
+from tests.calibration.tasks import MakeTask, found_by, row_of
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.errors import CalibrationError
 from ttscompile.rivals import gates, static
@@ -34,7 +33,7 @@ def test_deepcache_spends_the_budget_on_full_steps() -> None:
 @pytest.mark.parametrize("blocks", [1, 2])
 def test_deepcache_with_nothing_between_the_outermost_blocks_is_refused(blocks: int) -> None:
     with pytest.raises(CalibrationError, match="a sparsity of 0;"):
-        strategy_of("deepcache").require_reach(4, blocks, 3 * blocks)
+        row_of("deepcache").require_reach(4, blocks, 3 * blocks)
 
 
 def test_delta_dit_keeps_the_front_fresh_and_then_the_rear() -> None:
@@ -52,7 +51,7 @@ def test_delta_dit_spends_the_budget_on_full_steps() -> None:
 
 def test_delta_dit_of_one_block_is_refused() -> None:
     with pytest.raises(CalibrationError, match="a sparsity of 0;"):
-        strategy_of("delta-dit").require_reach(4, 1, 3)
+        row_of("delta-dit").require_reach(4, 1, 3)
 
 
 def test_a_rule_takes_the_parameters_with_the_lowest_error(make_task: MakeTask) -> None:

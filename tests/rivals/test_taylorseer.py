@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.calibration.tasks import MakeTask, found_by, make_task as task_on
+from tests.calibration.tasks import MakeTask, found_by, make_task as task_on, row_of
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import observed, sample_calls
-from ttscompile.calibration.schedule import open_search
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import Plan
@@ -95,9 +94,9 @@ def test_the_best_warm_up_is_taken(make_task: MakeTask) -> None:
 
 def test_an_interrupted_search_has_its_correction(make_task: MakeTask) -> None:
     task = make_task(budget=24)
-    search = open_search("taylorseer", task)
+    search = row_of("taylorseer").search(task)
     search.advance(0)
-    again = open_search("taylorseer", task)
+    again = row_of("taylorseer").search(task)
     again.restore({name: value.copy() for name, value in search.state().items()})
     first, second = search.found().correction, again.found().correction
     assert first is not None

@@ -55,7 +55,7 @@ def own_artifact(toy_artifact: Artifact, tmp_path: Path) -> Artifact:
 @pytest.fixture
 def pruned(own_artifact: Artifact) -> Artifact:
     """A toy whose default plan is its pruner's, which has a thread and reads earlier calls."""
-    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"learned": ["schedule"]})
     return load_artifact(own_artifact.path)
 
 

@@ -73,7 +73,7 @@ def convert(target: Path, steps: int) -> None:
 def calibrate(target: Path) -> None:
     """The command, with even steps, which are the same every time, and the recording beside the artifact."""
     recording = str(target.with_name("calls.npz"))
-    run("calibrate", str(target), "--trajectories", recording, "--strategy", "interval", "--target-sparsity", "0.5")
+    run("calibrate", str(target), "--trajectories", recording, "--learn", "interval", "--target-sparsity", "0.5")
 
 
 def run(*words: str) -> None:

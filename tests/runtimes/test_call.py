@@ -194,7 +194,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     if not whole_steps:
         schedule[3, 1] = Source.COMPUTE
     path = make_artifact(toy_program(pruner=False, normed=True)).path
-    store_schedules(path, None, {"mine": schedule}, "mine", {"strategy": "tts"})
+    store_schedules(path, None, {"mine": schedule}, "mine", {"learned": ["schedule"]})
     artifact = load_artifact(path)
     runtime = open_runtime(artifact)
     assert isinstance(runtime.backend, OnnxBackend)

@@ -60,7 +60,7 @@ def test_a_schedule_is_lowered_once_at_load_and_never_in_a_call(
     own_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     schedules = {"half": uniform_plan(5, 5, 2), "most": uniform_plan(5, 5, 4)}
-    store_schedules(own_artifact.path, None, schedules, "half", {"strategy": "uniform"})
+    store_schedules(own_artifact.path, None, schedules, "half", {"learned": ["uniform"]})
     lowered: list[bytes] = []
 
     def counted(plan: PlanArray, groups: tuple[int, ...]) -> Instructions:

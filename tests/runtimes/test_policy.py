@@ -81,7 +81,7 @@ def test_the_default_plan_is_dense_until_calibration(quick: CompiledPolicy) -> N
 def test_plans_of_the_artifact_by_name(own_artifact: Artifact) -> None:
     mixed = uniform_plan(5, 5, 2)
     mixed[1] = R
-    store_schedules(own_artifact.path, dict(own_artifact.pruner), {"mixed": mixed}, "tts", {"strategy": "tts"})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {"mixed": mixed}, "tts", {"learned": ["schedule"]})
     for runtime in ("onnxruntime", "torch", "reference"):
         policy = load(own_artifact.path, runtime)
         assert set(policy.info.plans) == {"dense", "mixed", "tts"}

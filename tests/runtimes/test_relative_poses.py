@@ -177,7 +177,7 @@ def test_calibration_measures_what_the_network_says(tmp_path: Path) -> None:
         path, own = tmp_path / str(relative is None), spec()
         own = replace(own, chunk=replace(own.chunk, relative=relative))
         ttscompile.compile_denoiser(Arm().eval(), own, path)
-        ttscompile.calibrate(path, [recording], 0.6, "interval", progress=False)
+        ttscompile.calibrate(path, [recording], 0.6, learn=("interval",), progress=False)
         plans = (load_artifact(path).manifest.calibration or {})["plans"]
         found.append({name: (one["error"], one["distance"]) for name, one in plans.items()})
         shown.append(compare(path, [recording], calls=4).points[-1].furthest[0].actions)

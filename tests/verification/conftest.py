@@ -68,7 +68,7 @@ def calibrate(compiled: Path, directory: Path) -> None:
         pruner,
         {"schedule": policy.sparse(), "other": policy.other()},
         "schedule",
-        {"strategy": "by hand"},
+        {"learned": ["by hand"]},
         corrections={"schedule": corrected},
         golden=record_plans,
     )
@@ -87,7 +87,7 @@ def quick(compiled: Path, once: Once) -> Path:
     def calibrate_once(directory: Path) -> None:
         plans = {"schedule": policy.sparsest()}
         shutil.copytree(compiled, directory)
-        store_schedules(directory, None, plans, "schedule", {"strategy": "by hand"}, golden=record_plans)
+        store_schedules(directory, None, plans, "schedule", {"learned": ["by hand"]}, golden=record_plans)
 
     return once.folder("verified and quick", calibrate_once)
 

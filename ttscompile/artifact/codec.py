@@ -282,7 +282,7 @@ def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value, uses
 _SCORE = ("distance", "error", "error_p90", "of_other_noise", "sparsity", "flops_sparsity", "flops_saved", "tokens")
 _BUDGET = ("target_sparsity", "target_flops", "latency_ms", "max_action_error", "max_distance")
 _RECORD: Mapping[str, Any] = {
-    "strategy": str,
+    "strategy": str,  # in records of before; ``learned`` says it now
     "seed": int,
     "learned": tuple[str, ...],
     "plans": Mapping[str, Mapping[str, Any]],

@@ -1,7 +1,6 @@
 """Calibration: an artifact learns from a few recorded episodes which residuals it can reuse.
 
 The main path is ``pipeline``: ``trials`` of what the original answers; then each ``proposer`` proposes plans, and the
-``judge`` judges them. Schedules are found by ``strategies``, of which ``tts`` is the default. What was asked for and
-cannot be is a ``CalibrationError`` of any function of this room. This package, ``proposer`` and ``strategies`` import
-no torch.
+``judge`` judges them. Who proposes is told by the table of ``proposers``. What was asked for and cannot be is a
+``CalibrationError`` of any function of this room. This package, ``proposer`` and ``proposers`` itself import no torch.
 """

@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,10 +10,8 @@ import numpy as np
 from ..artifact.load import load_artifact
 from ..artifact.manifest import Manifest
 from ..core.correction import FEATURES, may_jump
-from ..core.plan import SCHEDULE
 from ..errors import CalibrationError
 from ..ir.program import Binding
-from .strategies import DEFAULT
 
 EVALUATIONS_A_MINUTE = 6400
 """Of the network, to make the calls to learn from, for each minute of the time limit; ``Trials`` may have more."""
@@ -75,12 +72,8 @@ def require_one_place(device: str | None, ray: str | None) -> None:
         )
 
 
-def require_loops_alone(learn: Sequence[str], strategy: str, *budgets: float | None) -> None:
-    """Raise where something is asked for that loops, which are learned, cannot keep."""
-    if SCHEDULE in learn:
-        raise CalibrationError("learn: expected a schedule or loops; found both. Leave one of them out.")
-    if strategy != DEFAULT:
-        raise CalibrationError(f"learn: loops need the strategy {DEFAULT!r}; found {strategy!r}. Leave it out.")
+def require_no_cells(*budgets: float | None) -> None:
+    """Raise where a budget is given that loops, which are learned, cannot keep."""
     if any(one is not None for one in budgets):
         raise CalibrationError(
             "learn: loops are chosen by their distance from the original and by their time; found a budget in cells."

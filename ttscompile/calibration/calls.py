@@ -45,7 +45,7 @@ class Split:
 
 def split_episodes(count: int, fraction: float, seed: int) -> Split:
     """Divide episodes at random; at least one for validation, and at least one is left to learn from."""
-    # Who draws has a number of its own beside the seed: 0 here, 1 calls, 2 their noise, 3 strategies, 4 to 6 the judge.
+    # Who draws has a number of its own beside the seed: 0 here, 1 calls, 2 their noise, 3 searches, 4 to 6 the judge.
     order = np.random.default_rng((seed, 0)).permutation(count).tolist()
     held_out = min(max(round(count * fraction), 1), count - 1)
     return Split(calibration=tuple(sorted(order[held_out:])), validation=tuple(sorted(order[:held_out])))

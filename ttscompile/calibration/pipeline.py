@@ -22,7 +22,7 @@ from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..trajectories import recorded_rate
 from ..verification.record_golden import record_plans
-from .arguments import calls_to_learn_from, require_directory, require_limits, require_loops_alone, require_one_place
+from .arguments import calls_to_learn_from, require_directory, require_limits, require_no_cells, require_one_place
 from .budget import DISTANCE, ERROR, LATENCY, goal_of
 from .calls import FRACTION, digest_of, load_episodes
 from .choose import choose, seconds_to_judge_others, seconds_to_time
@@ -30,12 +30,12 @@ from .clock import Clock
 from .judge import Score, other_noise, seconds_to_judge
 from .kept import Kept
 from .progress import Bar
-from .proposer import LOOPS, Proposer, Request, Row, rows_of
+from .proposer import Proposer, Request, Row
+from .proposers import LOOPS, SCHEDULES, rows_of
 from .recordings import warn_of_recordings
 from .schedule import FINISHED, TIME_LIMIT, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
-from .strategies import DEFAULT, strategy_of
 from .trials import LEARNED, Trials, base_of
 
 
@@ -45,7 +45,6 @@ class CalibrationResult:
 
     Attributes:
         learned: names of the proposers that took part.
-        strategy: how the schedule was found.
         seed: the seed of everything random.
         target_sparsity: what was asked for, or what the budget comes to.
         default_plan: the plan that the artifact now uses; a key of ``plans``.
@@ -67,7 +66,6 @@ class CalibrationResult:
     """
 
     learned: tuple[str, ...]
-    strategy: str
     seed: int
     target_sparsity: float
     default_plan: str
@@ -112,7 +110,6 @@ def calibrate(
     path: str | os.PathLike[str],
     trajectories: Sequence[str | os.PathLike[str]],
     target_sparsity: float | None = None,
-    strategy: str = DEFAULT,
     seed: int = 0,
     resume: bool = False,
     *,
@@ -143,7 +140,7 @@ def calibrate(
     cuts something short, or the budget is a latency, which is measured.
 
     At most one budget: ``target_sparsity``, ``target_flops``, ``latency_ms`` or ``max_action_error``. Beside the plan
-    that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline. A strategy that fits corrections adds
+    that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline. A proposer that fits corrections adds
     ``safe``, which computes twice as many cells, and ``fast``, which computes half as many. A calibration that learns a
     schedule replaces all plans but ``dense`` and ``full``, one that learns loops all but ``dense``; another one adds to
     them.
@@ -152,16 +149,16 @@ def calibrate(
         path: the artifact's directory.
         trajectories: recordings: ``.npz``, zarr, HDF5 or LeRobot data sets, see ``ttscompile.trajectories``.
         target_sparsity: share of the cells to reuse; if no budget is given, 0.95, or what leaves five whole steps.
-        strategy: how the schedule is found, see ``ttscompile.calibration.strategies``.
         seed: the seed of the split, the noise and the search.
         resume: go on where a calibration with the same arguments was interrupted, with the same calls whatever
             ``max_minutes`` is now; begins anew if none was.
-        learn: what is learned, names of ``ttscompile.calibration.proposer.PROPOSERS``, in their order there.
+        learn: what is learned, names of ``ttscompile.calibration.proposers.PROPOSERS``, in their order there; of what
+            makes a schedule, and of loops, one.
         target_flops: share of the FLOPs of a dense call to save, prologue and pruner counted.
         latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit. Where
             loops are learned the nearest plan is taken of whose calls 99 of 100 keep it.
         max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
-            the sparsest that was found below it. Only with a strategy that fits corrections.
+            the sparsest that was found below it. Only with a proposer that fits corrections.
         max_distance: by how much further from the original a plan may be that costs less than the one it was made from;
             None for what its proposer allows. Where loops are learned: the distance from the original that the
             default may have, see ``proposer.near``.
@@ -175,13 +172,13 @@ def calibrate(
         validation_fraction: of the episodes.
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise; of ``task``
             the path of the tokenizer that makes recorded instructions tokens.
-        correct: fit a correction of the sampler to the schedule of a strategy that fits none itself, and keep it if it
+        correct: fit a correction of the sampler to the schedule of a proposer that fits none itself, and keep it if it
             is better on calls that it was not fitted on.
         rank: of the low-rank update to each weight matrix, where weights are learned.
         updates: of the weights.
         device: where the calls compute, as torch calls it, ``cuda``; None for the CPU. The results differ from those of
             the CPU by rounding. ``latency_ms`` is of onnxruntime, on the CPU.
-        max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
+        max_intervals: an end that does not depend on the machine's speed; None for the search's own.
         progress: show a bar on standard error.
         ray: address of a Ray cluster that answers dense calls and compares candidates, or ``local`` for one of this
             machine's cores; the outcome is the same. All its machines see the artifact under the same path. None
@@ -208,10 +205,10 @@ def calibrate(
     torch_device = None if device is None else device_of(device)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
-    rows, strategy_row = rows_of(tuple(learn)), strategy_of(strategy)
+    rows = rows_of(tuple(learn))
     chooses, anew = LOOPS in learn, any(row.anew for row in rows)
     if chooses:
-        require_loops_alone(learn, strategy, target_sparsity, target_flops, max_action_error)
+        require_no_cells(target_sparsity, target_flops, max_action_error)
     directory = Path(path)
     require_directory(directory)
     # All the while: a second calibration would undo the first.
@@ -221,7 +218,7 @@ def calibrate(
             artifact = replace(artifact, envelope=None)
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
-        request = Request(goal, strategy, correct, max_intervals, rank, updates, margin=max_distance)
+        request = Request(goal, correct, max_intervals, rank, updates, margin=max_distance)
         if chooses:  # the distance is that of what is chosen in the end, and not of each that learns
             request = replace(request, margin=None, deadline_ms=latency_ms, by_time=True, threads=goal.threads)
             if max_distance is not None:
@@ -231,7 +228,7 @@ def calibrate(
             if (reason := proposer.applies(artifact)) is not None:
                 raise CalibrationError(reason)
         episodes = load_episodes(artifact.manifest.spec, trajectories, observation, artifact.tokenizer)
-        corrects = correct or any(row.corrects for row in rows) or (SCHEDULE in learn and strategy_row.fits_correction)
+        corrects = correct or any(row.corrects for row in rows)
         rate = policy_hz or recorded_rate(trajectories) or (artifact.manifest.calibration or {}).get("policy_hz")
         trains = any(row.trains for row in rows)
         chosen_anew = chooses and not trains  # weights are trained for what was best
@@ -244,7 +241,6 @@ def calibrate(
             "budget": None if chosen_anew else goal.record(),
             "threads": goal.threads if chooses else 1,
             "learn": [row.name for row in rows],
-            "strategy": strategy,
             "seed": seed,
             "validation_fraction": validation_fraction,
             "max_distance": None if chosen_anew else max_distance,
@@ -264,7 +260,7 @@ def calibrate(
         with Bar(progress) as bar:
             opened = {"clock": clock, "bar": bar, "pool": pool, "device": torch_device, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
-            warn_of_recordings(trials, rows, strategy_row, corrects)
+            warn_of_recordings(trials, rows, corrects)
             # Where a distance was allowed, no plan that is kept is too far away to be the default.
             kept = Kept(trials, anew, FARTHEST if max_distance is None else np.inf)
             _hear(kept, rows, proposers, clock, request)
@@ -275,11 +271,10 @@ def calibrate(
             else:
                 kept.judge_changed(artifact.plans)
         # Where no schedule is learned: what one would have been asked for.
-        schedule = next((one for one in proposers if isinstance(one, Schedule)), Schedule(request))
+        schedule = next((one for one in proposers if isinstance(one, Schedule)), Schedule(request, SCHEDULES[0]))
         asked_of_default = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(
             learned=tuple(row.name for row in rows),
-            strategy=strategy,
             seed=seed,
             target_sparsity=schedule.budget.sparsity(view.manifest),
             default_plan=kept.default,

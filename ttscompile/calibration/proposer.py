@@ -1,7 +1,7 @@
-"""What proposes plans to the judge: three members each, and a row in ``PROPOSERS``.
+"""What proposes plans to the judge: three members each, and a row in the table of ``proposers``.
 
-The command line reads names and what they tell here; so this module imports neither torch nor those of the proposers.
-Members as those of the algorithms of NNCF: whether it applies, what it does, and what it tells.
+The command line reads rows; so this module imports neither torch nor those of the proposers. Members as those of the
+algorithms of NNCF: whether it applies, what it does, and what it tells.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy.typing as npt
 
 from ..artifact.ceiling import BOUND, FARTHEST
-from ..core.plan import SCHEDULE, Plan
+from ..core.plan import Plan
 from ..errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .budget import Goal
     from .clock import Clock
     from .judge import Score
+    from .task import Search, Task
     from .trials import Trials
 
 SURE = 1.25
@@ -82,8 +83,7 @@ class Request:
     """What was asked for, as far as proposers read it.
 
     Attributes:
-        strategy: how schedules are found; a name of ``strategies``.
-        correct: whether a correction is fitted to what a strategy finds that fits none itself.
+        correct: whether a correction is fitted to the schedule of a proposer that fits none itself.
         intervals: of a search, at most; None for its own number.
         rank: of the low-rank update to each weight matrix.
         margin: what a proposer allows in place of its own (``Proposal.margin``); None leaves that to it.
@@ -94,7 +94,6 @@ class Request:
     """
 
     goal: Goal
-    strategy: str = "tts"
     correct: bool = False
     intervals: int | None = None
     rank: int = 16
@@ -155,10 +154,11 @@ class Row:
         what: what it learns: the end of a sentence.
         maker: where the class or function is that makes a ``Proposer`` of a ``Request``, as ``module:name`` below
             ``ttscompile``.
-        corrects: whether it fits corrections, which need many calls to learn from; of a schedule its strategy says so.
+        corrects: whether it fits corrections, which need many calls to learn from.
         trains: whether it trains a network on the calls, for which more of them are better.
         consecutive: whether it learns from consecutive calls too (``Trials.windows``).
-        anew: whether the plans of an earlier calibration go: all that follows is made from what it proposes.
+        anew: whether the plans of an earlier calibration go: what others propose is made from what it does. So one such
+            row takes part at most.
         lowers: whether it gives plans another precision, in which all of them are judged again.
         takes: its share of the time, beside those of the others that take part.
     """
@@ -179,45 +179,46 @@ class Row:
         return made
 
 
-LOOPS = "loops"
-"""The proposer after which the default is chosen among all plans that were kept (``choose``)."""
+@dataclass(frozen=True)
+class ScheduleRow(Row):
+    """A proposer of schedules: ``schedule.Schedule``, with a search of the row's own.
 
-PROPOSERS = (
-    Row(SCHEDULE, "which steps are computed, with corrections and jumps", "calibration.schedule:Schedule", anew=True),
-    Row(
-        LOOPS,
-        "which loop, and how few of its steps; the default is chosen at the end",
-        "calibration.proposers.loops:Loops",
-        corrects=True,
-        anew=True,
-        takes=6.0,
-    ),
-    Row("pruner", "gates for each observation", "calibration.proposers.pruner:Pruner", consecutive=True),
-    Row(
-        "precision",
-        "which parts compute in the other precision",
-        "calibration.proposers.precision:Precision",
-        lowers=True,
-    ),
-    Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
-    Row(
-        "weights",
-        "low-rank updates of later steps' weights",
-        "calibration.proposers.weights:Weights",
-        corrects=True,
-        trains=True,
-    ),
-    Row("start", "how many steps a call needs that begins with the chunk before", "calibration.proposers.start:Start"),
-)
-"""In the order in which they propose, whatever the order in which they are asked for."""
+    Attributes:
+        maker: where the class or function is that makes a ``Search`` of a ``Task``.
+        corrects: whether its schedule is of whole steps, with a correction of the sampler that is fitted to it. Only
+            then are there plans for an error budget, and plans beside the target.
+        consecutive: whether it learns from consecutive calls, so that its plans may read what an earlier call computed.
+        least: how many cells its plans compute at least, of ``(steps, blocks)``; by default those of step 0.
+        uses_pruner: whether the pruner may depart from its schedule.
+        baseline: whether it is the uniform schedule, which every other one has to beat.
+    """
 
-NAMES = tuple(row.name for row in PROPOSERS)
+    anew: bool = True
+    least: Callable[[int, int], int] = lambda steps, blocks: blocks
+    uses_pruner: bool = False
+    baseline: bool = False
 
+    def make(self, request: Request) -> Proposer:
+        """``Schedule``, which proposes what the search of this row finds."""
+        made: Proposer = pkgutil.resolve_name("ttscompile.calibration.schedule:Schedule")(request, self)
+        return made
 
-def rows_of(learn: tuple[str, ...]) -> tuple[Row, ...]:
-    """The rows of these names, in the order of ``PROPOSERS``."""
-    unknown = [name for name in learn if name not in NAMES]
-    if unknown or not learn:
-        found = repr(unknown[0]) if unknown else "none"
-        raise CalibrationError(f"learn: expected some of {', '.join(NAMES)}; found {found}.")
-    return tuple(row for row in PROPOSERS if row.name in learn)
+    def search(self, task: Task) -> Search:
+        """The search, ready to begin. Raises ImportError or AttributeError: there is no such module, or maker in it."""
+        self.require_reach(task.runner.model.steps, task.runner.model.blocks, task.budget)
+        made: Search = pkgutil.resolve_name(f"ttscompile.{self.maker}")(task)
+        return made
+
+    def require_reach(self, steps: int, blocks: int, budget: int) -> None:
+        """Refuse a budget of computed cells, step 0 included, that it cannot keep.
+
+        Raises:
+            CalibrationError: it computes more; says how much sparsity it can reach.
+        """
+        least, cells = self.least(steps, blocks), steps * blocks
+        if budget < least:
+            raise CalibrationError(
+                f"{self.name!r} computes at least {least} of the {steps} x {blocks} cells, a sparsity of"
+                f" {1 - least / cells:.4g}; the target of {1 - budget / cells:.4g} leaves {budget}. Lower the target,"
+                " or take another proposer."
+            )

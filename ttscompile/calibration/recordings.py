@@ -3,11 +3,9 @@
 from collections.abc import Sequence
 
 from ..artifact.ceiling import few_steps
-from ..core.plan import SCHEDULE
 from .calls import window_of
 from .judge import other_noise, other_observations
 from .proposer import Row
-from .strategy import Strategy
 from .targets import REPEATS
 from .trials import Trials
 
@@ -16,14 +14,13 @@ UNHEARD = 0.9
 0.97 to 1 with data times 100, a hundredth of them, or random ones."""
 
 
-def warn_of_recordings(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:
+def warn_of_recordings(trials: Trials, rows: Sequence[Row], corrects: bool) -> None:
     """Warn, before anything is learned, of what makes it learn little."""
     bar, fewest = trials.bar, trials.limits.fewest
     if (warning := few_steps(trials.runner.view.manifest)) is not None:
         bar.warn(warning)
-    consecutive = any(row.consecutive or (row.name == SCHEDULE and strategy.consecutive) for row in rows)
     window = window_of(trials.episodes, trials.split)
-    if consecutive and (short := sum(each.calls < window for each in trials.episodes)):
+    if any(row.consecutive for row in rows) and (short := sum(each.calls < window for each in trials.episodes)):
         bar.warn(
             f"{short} of {len(trials.episodes)} episodes have fewer than {window} calls, and are left out where"
             f" {window} consecutive ones are learned from."

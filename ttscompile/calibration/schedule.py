@@ -1,4 +1,4 @@
-"""The proposer of schedules: a strategy at work as long as there is time, the baseline, and plans beside the target."""
+"""The proposer of schedules: a search for as long as there is time, the baseline, and plans beside the target."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -13,18 +13,10 @@ from ..ir.plan_head import has_head
 from .budget import ERROR, FLOPS, LATENCY, Goal, cells_of, measure_budget
 from .clock import Clock
 from .judge import Score
-from .proposer import Proposal, Proposals, Proposer, Request
+from .proposer import Proposal, Proposals, Proposer, Request, ScheduleRow
 from .step_counts import BESIDE_SHARE, SAFE, SpacedSchedules, budget_of_error, plans_beside
-from .strategies import CORRECTING, strategy_of
 from .task import Found, Search, Task
 from .trials import Trials, base_of
-
-
-def open_search(name: str, task: Task) -> Search:
-    """The search of the strategy of this name, ready to begin."""
-    strategy, model = strategy_of(name), task.runner.model
-    strategy.require_reach(model.steps, model.blocks, task.budget)
-    return strategy.make()(task)
 
 
 def search_plan(
@@ -38,7 +30,7 @@ def search_plan(
 
     Args:
         search: after its first ``first`` intervals.
-        most: intervals; None for the strategy's own number.
+        most: intervals; None for the search's own number.
         first: the interval to begin with.
         after: told after each interval how many are done, and how many seconds the longest took.
 
@@ -98,14 +90,14 @@ BETTER = 0.9
 
 
 class Schedule(Proposer):
-    """Plans of whole steps, corrected; or what another strategy finds. See ``Proposer``.
+    """Plans of whole steps, corrected; or what the search of another row finds. See ``Proposer``.
 
     It tells its budget, once it is known what it comes to, why it stopped, and why there is no plan of a name.
     """
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: Request, row: ScheduleRow) -> None:
         super().__init__(request)
-        self._strategy = strategy_of(request.strategy)
+        self._row = row
         self.budget, self.intervals, self.stopped = request.goal, 0, ""
         self.skipped: dict[str, str] = {}
 
@@ -114,17 +106,17 @@ class Schedule(Proposer):
         if view.manifest.steps == 1:
             told = "the policy has one denoising step, which every plan computes: nothing can be reused"
             return f"{told}. Learn which parts may have eight bits: --learn precision."
-        if goal.kind == ERROR and not self._strategy.fits_correction:
+        if goal.kind == ERROR and not self._row.corrects:
             return (
-                f"max_action_error needs strategy {' or '.join(map(repr, CORRECTING))}; found {self._strategy.name!r}."
-                " Give this strategy a target_sparsity, a target_flops or a latency_ms."
+                f"max_action_error: expected a proposer that fits corrections, {SCHEDULE!r}; found {self._row.name!r}."
+                " Give this one a target_sparsity, a target_flops or a latency_ms."
             )
-        if self.request.correct and self._strategy.fits_correction:
-            return f"strategy {self._strategy.name!r} fits a correction of its own. Leave correct out."
+        if self.request.correct and self._row.corrects:
+            return f"{self._row.name!r} fits a correction of its own. Leave correct out."
         try:
             if goal.kind not in (LATENCY, ERROR):
                 cells = cells_of(goal, view.manifest, self._may_prune(view))
-                self._strategy.require_reach(view.manifest.steps, len(view.manifest.blocks), cells)
+                self._row.require_reach(view.manifest.steps, len(view.manifest.blocks), cells)
         except CalibrationError as error:
             return str(error)
         return None
@@ -134,15 +126,15 @@ class Schedule(Proposer):
         self._manifest = view.manifest
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)
         budget = self._budget(trials, view, clock)
-        calls = trials.windows if self._strategy.consecutive else trials.calls
+        calls = trials.windows if self._row.consecutive else trials.calls
         small = calls.count > trials.limits.usual
         task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small=small)
         crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
         if budget is None:
             budget = budget_of_error(crowded, request.goal, steps, blocks)
-        share = 1 - BESIDE_SHARE if self._strategy.fits_correction else 1.0
+        share = 1 - BESIDE_SHARE if self._row.corrects else 1.0
         task = replace(task, budget=budget.cells, clock=clock.until(share))
-        search = open_search(request.strategy, task)
+        search = self._row.search(task)
         found, self.intervals, self.stopped = resumed_search(trials, search, task.clock, request.intervals)
         if request.correct:
             found = task.corrected(found)
@@ -163,13 +155,13 @@ class Schedule(Proposer):
             found, budget = task.whole_steps(best.steps), replace(budget, cells=more * blocks)
         if not kept:
             return
-        self.told = f"{budget.cells} of {steps * blocks} cells may be computed; strategy {request.strategy!r} took "
-        self.told += f"{self.intervals} interval{'s' * (self.intervals != 1)}"
+        self.told = f"{budget.cells} of {steps * blocks} cells may be computed; the search took {self.intervals}"
+        self.told += f" interval{'s' * (self.intervals != 1)}"
         if "steps" in found.notes and (heard := task.whole.told_of_episodes(found.notes["steps"])):
             self.told += f"; {heard}"
         if found.pruner is not None:
             yield self._of_pruner(plan, found)
-        named, self.skipped = plans_beside(crowded, task, self._strategy, budget.cells)
+        named, self.skipped = plans_beside(crowded, task, self._row, budget.cells)
         self.stopped = TIME_LIMIT if clock.left_out else self.stopped
         for name, one in named.items():
             made = replace(plan, cells=one.schedule, correction=one.correction)
@@ -189,12 +181,12 @@ class Schedule(Proposer):
             known = {"cells": budget.cells, "measured": budget.measured}
             trials.state.save(latency=known, seconds=clock.elapsed())
         budget = replace(goal, cells=known["cells"], measured=known["measured"])
-        self._strategy.require_reach(manifest.steps, len(manifest.blocks), budget.cells)
+        self._row.require_reach(manifest.steps, len(manifest.blocks), budget.cells)
         return budget
 
     def _may_prune(self, view: View) -> bool:
         """Whether plans may be made by the pruner, whose cost then counts."""
-        return self._strategy.uses_pruner and has_head(view.pruner)
+        return self._row.uses_pruner and has_head(view.pruner)
 
     def _of_pruner(self, plan: Plan, found: Found) -> Proposal:
         """The plans that the pruner makes, if they are nearer than the schedule."""
@@ -219,15 +211,15 @@ class Schedule(Proposer):
         if goal.kind == FLOPS and score.flops_saved < goal.value - 1e-9:
             return (
                 f"saves {score.flops_saved:.4f} of the FLOPs of a dense call; the target is {goal.value:g}: its blocks"
-                " cost more than the average. Raise the target a little, or take strategy"
-                f" {' or '.join(map(repr, CORRECTING))}, which computes whole steps."
+                f" cost more than the average. Raise the target a little, or learn {SCHEDULE!r}, which computes whole"
+                " steps."
             )
         if goal.kind == ERROR and score.error is not None and not score.error <= goal.value:
             return (
                 f"computes {self.budget.cells} cells, and is {score.error:.4g} off on average on held-out calls; at"
                 f" most {goal.value:g} was asked for. Allow a larger error, more time, or calibrate with more episodes."
             )
-        if not (self._strategy.baseline or score.distance < BETTER * uniform.distance):
+        if not (self._row.baseline or score.distance < BETTER * uniform.distance):
             return (
                 f"is no better than the uniform schedule: on held-out calls its distance from the original is"
                 f" {score.distance:.4g}, the uniform schedule's {uniform.distance:.4g} (expected below {BETTER:.0%} of"

@@ -15,8 +15,8 @@ from ..errors import CalibrationFailedError
 from .budget import Goal
 from .clock import Clock
 from .progress import Bar
+from .proposer import ScheduleRow
 from .state import StateFile
-from .strategy import Strategy
 from .task import Found, Task
 from .whole_steps import Errors, WholeSteps
 
@@ -151,17 +151,17 @@ def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: in
 
 
 def plans_beside(
-    crowded: SpacedSchedules, task: Task, strategy: Strategy, cells: int
+    crowded: SpacedSchedules, task: Task, row: ScheduleRow, cells: int
 ) -> tuple[dict[str, Found], dict[str, str]]:
     """Make ``safe`` and ``fast``, where they can be made: whole steps with a correction fitted on all calls.
 
-    ``strategy`` found the target's plan, which computes ``cells``.
+    The search of ``row`` found the target's plan, which computes ``cells``.
     """
     steps, target = task.runner.model.steps, max(1, cells // task.runner.model.blocks)
     plans: dict[str, Found] = {}
     skipped: dict[str, str] = {}
-    if not strategy.fits_correction:
-        return plans, dict.fromkeys((SAFE, FAST), f"needs a correction: strategy {strategy.name!r} fits none")
+    if not row.corrects:
+        return plans, dict.fromkeys((SAFE, FAST), f"needs a correction: {row.name!r} fits none")
     if 2 * target >= steps:
         skipped[SAFE] = f"would be the dense plan: twice {target} of {steps} steps"
     if target <= 2:

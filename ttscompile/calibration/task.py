@@ -1,4 +1,4 @@
-"""What a strategy is given (``Task``), how it is interrupted (``Search``), and what it gives (``Found``)."""
+"""What a search is given (``Task``), how it is interrupted (``Search``), and what it gives (``Found``)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class Found:
-    """The outcome of a strategy.
+    """The outcome of a search.
 
     Attributes:
         schedule: int8 ``[K, blocks]``, within the budget.
@@ -91,7 +91,7 @@ class Task:
         return Found(plan, {"steps": list(steps), **_of_correction(correction), **notes}, correction)
 
     def corrected(self, found: Found) -> Found:
-        """What a strategy found, with corrections where they are better: of the schedule, and of the pruner's plans.
+        """What a search found, with corrections where they are better: of the schedule, and of the pruner's plans.
 
         The pruner's plans share one correction, fitted along the plan that each call has.
 
@@ -101,7 +101,7 @@ class Task:
         if self.calls.window == 1 and (found.schedule == Source.ROLLOUT.value).any():
             raise CalibrationError(
                 "a correction is fitted to a schedule on calls of their own; this one reads residuals of earlier calls."
-                " Leave correct out, or take another strategy."
+                " Leave correct out, or take another proposer."
             )
         correction = self.whole.correction_of(found.schedule)
         notes = {**found.notes, "corrected": correction is not None, **_of_correction(correction)}
@@ -118,7 +118,7 @@ def _of_correction(correction: Correction | None) -> dict[str, int]:
 
 
 class Search(Protocol):
-    """A strategy at work, in at most ``intervals``. Between two it can stop, and go on later from its ``state``."""
+    """Looks for a schedule, in at most ``intervals``. Between two it can stop, and go on later from its ``state``."""
 
     intervals: int
 

@@ -7,8 +7,7 @@ import click
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.proposer import NAMES as LEARNED, PROPOSERS
-from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
+from ttscompile.calibration.proposers import PROPOSERS, RIVALS
 from ttscompile.cli import options
 from ttscompile.cli.ending import Status
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
@@ -17,15 +16,18 @@ from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
 from ttscompile.core.plan import SCHEDULE
 
+_LEARNED = "; ".join(f"{one.name}: {one.what}" for one in PROPOSERS if one not in RIVALS)
+_RIVALS = ", ".join(one.name for one in RIVALS)
+
 
 @click.command(cls=SectionedCommand)
 @options.artifact_argument
 @trajectories_options()
 @options.names_option(
     "--learn",
-    LEARNED,
+    [one.name for one in PROPOSERS],
     default=SCHEDULE,
-    help=f"Learn these, in this order: {'; '.join(f'{one.name}: {one.what}' for one in PROPOSERS)}.",
+    help=f"Learn these, in this order: {_LEARNED}. In place of schedule, a rival to compare it with: {_RIVALS}.",
 )
 @options.number_option(
     "--target-sparsity",
@@ -57,12 +59,6 @@ from ttscompile.core.plan import SCHEDULE
     " original that the default plan may have.",
 )
 @options.threads_option("Time the calls of --latency-ms with so many threads.")
-@click.option(
-    "--strategy",
-    type=click.Choice(NAMES),
-    default=DEFAULT,
-    help=f"Find the schedule by this strategy. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
-)
 @options.seed_option("Draw the split, the noise and the training with this seed.")
 @options.number_option(
     "--max-minutes",

@@ -252,7 +252,7 @@ def print_comparison(found: Comparison, output: Console) -> None:
     say(
         output,
         "Distance: between the actions and the original's for the same observation, in units of what other noise"
-        f" changes; 0 is the same. {found.calls} observations of episodes that no strategy here learned from, each with"
+        f" changes; 0 is the same. {found.calls} observations of episodes that nothing here was learned from, each with"
         " several draws of noise. Error: with the same noise, in the units of the actions, in which two calls of the"
         f" original are {found.other_noise:.4g} apart; another sampler takes other noise, and has none. Latency:"
         f" medians, one stream, {_threads(found)}. Frontier: no other plan is faster and nearer. Outside: within"

@@ -151,8 +151,8 @@ class Point:
     """One plan.
 
     Attributes:
-        series: strategy, or artifact.
-        name: of the plan in its series; a sparsity of a strategy.
+        series: proposer, or artifact.
+        name: of the plan in its series; a sparsity of a proposer.
         distance: of its actions from the original's (``calibration.judge``).
         latency_ms: median wall time of a call on one stream.
     """
@@ -281,7 +281,7 @@ class Comparison:
         calls: held-out calls that each point was measured on.
         threads: threads that onnxruntime computed with.
         other_noise: mean absolute difference of two dense calls of one observation, in the units of the actions.
-        skipped: why a strategy has no plan at a sparsity.
+        skipped: why a proposer has no plan at a sparsity.
     """
 
     points: tuple[MeasuredPoint, ...]

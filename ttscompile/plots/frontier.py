@@ -51,7 +51,7 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
         )
     first, last = (log(end([p.latency_ms for p in shown], default=1.0)) for end in (min, max))
     told = shown if len(shown) <= MOST_NAMES else [p for p in shown if p in efficient]
-    several = len({p.name for p in told}) < len(told)  # strategies have a plan of the same name each
+    several = len({p.name for p in told}) < len(told)  # proposers have a plan of the same name each
     taken = list[tuple[float, float, float]]()  # from where to where a name goes, and at which height
     for p in told:
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)

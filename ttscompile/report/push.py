@@ -183,11 +183,14 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
     more += f" --prediction-horizon {spec.sample[0]}" * (spec.left_out > 0)
     lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{more}{precision}"]
     if record is not None:
-        told, budget = {key: record[key] for key in ("strategy", "seed") if key in record}, record.get("budget", {})
-        goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error", "max_distance")
+        budget = record.get("budget", {}) | {"seed": record.get("seed")}
+        learned, made = record.get("learned", [SCHEDULE]), record.get("strategy", "tts")
+        if made != "tts":  # of before: what made the schedule, where that was not this project's own search
+            learned = [made if one == SCHEDULE else one for one in learned]
+        goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error", "max_distance", "seed")
         asked = {key: budget[key] for key in goals if budget.get(key) is not None}
-        words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
-        if (learned := record.get("learned", [])) not in ([], [SCHEDULE]):
+        words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in asked.items())
+        if learned not in ([], [SCHEDULE]):
             words += f" --learn {','.join(map(_word, learned[:8]))}"
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
     lines.append("ttscompile verify DIR")

@@ -227,9 +227,9 @@ def test_the_rate_of_a_distillation_that_goes_on_is_not_what_it_began_with(
 
 def test_what_was_interrupted_is_not_taken_for_something_else(copied: Path, recording: Path) -> None:
     with killed():
-        calibrate(copied, [recording], 0.8, "interval", progress=False)
+        calibrate(copied, [recording], 0.8, learn=("interval",), progress=False)
     assert (copied / FILE).exists()
-    with pytest.raises(CalibrationError, match=r"had other settings: .*learn was \['schedule'\], now \['weights'\]"):
+    with pytest.raises(CalibrationError, match=r"had other settings: .*learn was \['interval'\], now \['weights'\]"):
         train(copied, recording, resume=True)
     with killed():
         train(copied, recording)
@@ -327,7 +327,7 @@ def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
 def test_a_plan_that_cannot_be_distilled(artifact: Path, recording: Path, changes: dict[str, Any]) -> None:
     trials = trials_of(artifact, [recording])
     plan = replace(trials.base, cells=whole_steps_plan(policies.STEPS, 6, [0, 5]))
-    with pytest.raises(CalibrationFailedError, match="is another one. Learn 'schedule' with strategy 'tts'"):
+    with pytest.raises(CalibrationFailedError, match="is another one. Learn 'schedule', which makes"):
         proposed(Weights(request(rank=4)), trials, replace(plan, **changes))
 
 

@@ -144,7 +144,7 @@ def test_an_artifact_executes_it(
     directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
     recording = record(tmp_path / "calls.npz", episodes=24)
     result = ttscompile.calibrate(
-        directory, [recording], 0.6, "tts-paper", correct=correct, progress=False, max_minutes=1
+        directory, [recording], 0.6, learn=("tts-paper",), correct=correct, progress=False, max_minutes=1
     )
     assert result.plans["pruner"].sparsity >= 0.6 - 1e-9
     artifact = load_artifact(directory)
@@ -165,7 +165,7 @@ def test_a_head_that_has_learned_nothing_says_so_and_is_no_default(
     """One update, as on a busy machine: the head makes one plan for all observations, which is the schedule's."""
     directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
     recording, before = record(tmp_path / "calls.npz", episodes=8), load_artifact(compiled).pruner
-    result = ttscompile.calibrate(directory, [recording], 0.6, "tts-paper", max_intervals=1)
+    result = ttscompile.calibrate(directory, [recording], 0.6, learn=("tts-paper",), max_intervals=1)
     assert result.default_plan == "schedule"
     assert "has learned nothing in 1 update" in result.skipped["pruner"]
     assert "'pruner' is left out: it has learned nothing in 1 update" in capsys.readouterr().err

@@ -28,7 +28,7 @@ PLAN = "tts"
 def pruned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A toy whose default plan is its pruner's, which reads earlier calls; eight actions a chunk."""
     artifact = written_artifact(toy_program(horizon=9), tmp_path_factory.mktemp("pruned") / "artifact")
-    store_schedules(artifact.path, dict(artifact.pruner), {}, PLAN, {"strategy": "tts"})
+    store_schedules(artifact.path, dict(artifact.pruner), {}, PLAN, {"learned": ["schedule"]})
     return artifact.path
 
 

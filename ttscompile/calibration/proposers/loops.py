@@ -28,10 +28,11 @@ from ..arguments import MOST_CALLS, MOST_NEEDED, CallLimits, calls_to_learn_from
 from ..clock import Clock
 from ..judge import TIMED, Score, judge, other_noise, other_observations, seconds_to_judge, timed
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
-from ..schedule import intervals_of, open_search, resumed_search
+from ..schedule import intervals_of, resumed_search
 from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules, spaced_steps
 from ..task import Found, Task
 from ..trials import Trials
+from ..tts import Tts
 
 HOPELESS = 5.0
 """A number of steps is not searched any further if the error of its crowded schedules, as a share of what other noise
@@ -159,7 +160,7 @@ class Loops(Proposer):
             if number and _over(clock, own, intervals_of(name), name):
                 break
             share = _ending(clock, clock.left() / (len(counts) - number))
-            search = open_search("tts", replace(task, clock=share, budget=count * own.runner.model.blocks))
+            search = Tts(replace(task, clock=share, budget=count * own.runner.model.blocks))
             found = resumed_search(own, search, share, None, name)[0]
             yield from self._judged(own, self._proposal(task, loop, count, found), cost.of(count))
             before, reached = reached, self._reached(loop, count, wanted)

@@ -296,8 +296,8 @@ def _require_whole_steps(trials: Trials, plan: Plan) -> None:
             return
     raise CalibrationFailedError(
         "weights are trained for a schedule of whole steps, two of them computed at least and TIMESTEP elsewhere, that"
-        f" begins with noise and has the original's weights; plan {trials.name!r} is another one. Learn 'schedule' with"
-        " strategy 'tts', which makes such plans."
+        f" begins with noise and has the original's weights; plan {trials.name!r} is another one. Learn"
+        " 'schedule', which makes such plans."
     )
 
 

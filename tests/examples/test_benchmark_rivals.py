@@ -1,4 +1,4 @@
-"""The script that compares strategies: what it prints, and what it refuses; and the one of calls in a row."""
+"""The script that compares rivals: what it prints, and what it refuses; and the one of calls in a row."""
 
 import json
 import shutil
@@ -8,7 +8,7 @@ from typing import Any
 import in_a_row
 import pytest
 from click.testing import CliRunner
-from strategies import default_sparsities, main
+from rivals import default_sparsities, main
 
 from ttscompile.artifact.load import load_artifact
 
@@ -28,7 +28,7 @@ def run(*words: str) -> Any:
 
 @pytest.mark.slow
 def test_it_prints_the_same_as_a_table_and_as_json(arguments: list[str], tmp_path: Path) -> None:
-    asked = [*arguments, "--strategies", "interval", "--sparsities", "0.5,0.8"]
+    asked = [*arguments, "--learn", "interval", "--sparsities", "0.5,0.8"]
     told = run(*asked, "--correct", "--json", "--plot", str(tmp_path / "f.svg"), "--into", str(tmp_path / "found"))
     record = json.loads(told.stdout)
     points = record["comparison"]["points"]
@@ -51,10 +51,10 @@ def test_without_sparsities_those_are_taken_that_the_steps_allow(arguments: list
     assert default_sparsities(100) == (0.9, 0.95, 0.98)
     assert default_sparsities(16) == (11 / 16, 13 / 16, 14 / 16)
     assert (default_sparsities(3), default_sparsities(2), default_sparsities(1)) == ((1 - 2 / 3,), (0.5,), ())
-    told = run(*arguments, "--json", "--strategies", "interval")  # of ten steps: 95 % is none
+    told = run(*arguments, "--json", "--learn", "interval")  # of ten steps: 95 % is none
     found = json.loads(told.stdout)["comparison"]["points"]
     assert [point["name"] for point in found if point["series"] == "interval"] == ["0.5", "0.7", "0.8"]
-    alone = run(*arguments, "--json", "--strategies", "")
+    alone = run(*arguments, "--json", "--learn", "")
     assert {point["series"] for point in json.loads(alone.stdout)["comparison"]["points"]} == {"this artifact"}
 
 
@@ -68,7 +68,7 @@ def test_plans_are_not_written_over_what_takes_part(arguments: list[str]) -> Non
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--strategies", "magic", "'magic' is not one of tts"),
+        ("--learn", "magic", "'magic' is not one of schedule, tts-paper"),
         ("--sparsities", "0.9,x", "could not convert"),
         ("--sparsities", "1", "1 is not above 0 and below 1"),
     ],

@@ -1,6 +1,6 @@
-"""What accuracy costs with published strategies: each finds a plan for each share of reused cells, or each time, now.
+"""What accuracy costs with rivals: each finds a plan for each share of reused cells, or each time, now.
 
-    python examples/benchmark/strategies.py compiled/ -t calls.npz --strategies tts,bac,interval --plot frontier.png
+    python examples/benchmark/rivals.py compiled/ -t calls.npz --learn schedule,bac,interval --plot frontier.png
 
 With ``--latency-ms`` or ``--even-steps`` each gets the largest budget, in its own cells, whose plan keeps the time
 (``equal_time.py``): plans of as many cells do not take equally long.
@@ -23,7 +23,7 @@ from searches import LEARNED, Searching
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable, update_plans
-from ttscompile.calibration.strategies import NAMES
+from ttscompile.calibration.proposers import SCHEDULES
 from ttscompile.calibration.trials import Trials
 from ttscompile.cli.contestants import compare, draw_comparison, print_comparison
 from ttscompile.cli.options import (
@@ -75,7 +75,12 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
 @click.command(cls=SectionedCommand)
 @artifact_argument
 @trajectories_options()
-@names_option("--strategies", NAMES, default="tts,bac,interval", help="Have each of these find plans.")
+@names_option(
+    "--learn",
+    [row.name for row in SCHEDULES],
+    default="schedule,bac,interval",
+    help="Have each of these propose schedules.",
+)
 @click.option(
     "--sparsities",
     type=TEXT,
@@ -87,7 +92,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     "--latency-ms",
     type=TEXT,
     callback=_milliseconds,
-    help="In place of sparsities: give each strategy the most cells with which its calls take so many milliseconds.",
+    help="In place of sparsities: give each the most cells with which its calls take so many milliseconds.",
 )
 @click.option(
     "--even-steps",
@@ -106,12 +111,12 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     type=Number(0, 1e6),
     default=3.0,
     show_default=True,
-    help="End each search after so many minutes, about; there is one for each strategy and sparsity.",
+    help="End each search after so many minutes, about; there is one for each proposer and sparsity.",
 )
 @click.option(
     "--correct",
     is_flag=True,
-    help="Let plans of strategies that fit no correction take part a second time, with one that is fitted to them.",
+    help="Let plans of those that fit no correction take part a second time, with one that is fitted to them.",
 )
 @count_option("--intervals", "End each search after so many intervals; for a quick look.", default=None)
 @count_option("--seed", "Seed of the split, the noise and the searches.", default=0, least=0, most=MOST_SEED)
@@ -129,7 +134,7 @@ def main(
     directory: Path,
     trajectories: tuple[Path, ...],
     sources: Sources,
-    strategies: tuple[str, ...],
+    learn: tuple[str, ...],
     sparsities: tuple[float, ...] | None,
     latency_ms: tuple[float, ...],
     even_steps: tuple[int, ...] | None,
@@ -143,7 +148,7 @@ def main(
     as_json: bool,
     **search: Any,  # Searching takes them by the same names
 ) -> None:
-    """Hold plans that strategies find now against those of the artifact DIRECTORY."""
+    """Hold plans that proposers of schedules find now against those of the artifact DIRECTORY."""
     if into is not None:
         require_replaceable(into)
         if into.resolve() in [path.resolve() for path in (directory, *others)]:
@@ -160,8 +165,8 @@ def main(
         given = [pace_of(trials, one, threads) for one in latency_ms]
         return given + [Pace(trials, count, threads, f"as-{count}") for count in even_steps or ()]
 
-    wished = () if timed or not strategies else sparsities or default_sparsities(of.steps)
-    joining = Searching(directory, strategies, wished, learned=learned_calls, paces=paces if timed else None, **search)
+    wished = () if timed or not learn else sparsities or default_sparsities(of.steps)
+    joining = Searching(directory, learn, wished, learned=learned_calls, paces=paces if timed else None, **search)
     how: dict[str, Any] = {"observation": sources, "calls": calls, "threads": threads, "seed": seed}
     found = compare(directory, artifacts, others, trajectories, joining=joining, **how)
     if as_json:

@@ -1,5 +1,6 @@
-"""What holds for every strategy: plans are legal and within the budget, and an interruption changes nothing."""
+"""What holds for each proposer of schedules: plans are legal and within the budget; interruptions change nothing."""
 
+import pkgutil
 import re
 import subprocess
 import sys
@@ -11,19 +12,21 @@ import numpy as np
 import pytest
 
 import ttscompile
+from ttscompile.calibration.proposer import ScheduleRow
+from ttscompile.calibration.proposers import PROPOSERS, RIVALS, SCHEDULES, rows_of
 from ttscompile.calibration.pruner import paper
-from ttscompile.calibration.schedule import open_search, search_plan
-from ttscompile.calibration.strategies import CORRECTING, DEFAULT, NAMES, STRATEGIES, strategy_of
-from ttscompile.calibration.strategy import Strategy
+from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.task import Found, Task
 from ttscompile.core.lattice import Source, illegal_cells
 from ttscompile.errors import CalibrationError
 from ttscompile.rivals import evo, gates, online
 
-from .tasks import MakeTask, found_by
+from .tasks import MakeTask, found_by, row_of
+
+NAMES = [row.name for row in SCHEDULES]
 
 BUDGET = 34
-"""Of 10 x 6 cells: enough for all strategies."""
+"""Of 10 x 6 cells: enough for all searches."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -63,7 +66,7 @@ def test_a_plan_is_legal_and_within_the_budget(
     assert found.schedule.dtype == np.int8
     assert not illegal_cells(found.schedule, model.groups, np.zeros(found.schedule.shape, np.bool_)).any()
     computed = int((found.schedule == Source.COMPUTE).sum())
-    assert budget - model.blocks < computed <= budget  # and hardly less: no strategy leaves a whole step unused
+    assert budget - model.blocks < computed <= budget  # and hardly less: no search leaves a whole step unused
 
 
 @pytest.mark.slow
@@ -72,12 +75,12 @@ def test_going_on_from_a_state_ends_where_another_run_ends(
     make_task: MakeTask, whole: Callable[[str, int], tuple[Found, Task]], name: str
 ) -> None:
     expected, task = whole(name, BUDGET)[0], make_task(BUDGET, calls=8)
-    stopped = open_search(name, task)
+    stopped = row_of(name).search(task)
     stopped.advance(0)
     if not stopped.done:
         stopped.advance(1)
     state = stopped.state()
-    resumed = open_search(name, task)
+    resumed = row_of(name).search(task)
     resumed.restore({key: value.copy() for key, value in state.items()})
     assert resumed.done == stopped.done
     np.testing.assert_array_equal(resumed.plan, stopped.plan)
@@ -87,7 +90,7 @@ def test_going_on_from_a_state_ends_where_another_run_ends(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["evo", "dip-go", "tts"])
+@pytest.mark.parametrize("name", ["evo", "dip-go", "schedule"])
 def test_a_search_beats_even_steps(make_task: MakeTask, name: str) -> None:
     task = make_task(20, calls=24)
     even, searched = (task.error(found_by(one, task).schedule, task.calls) for one in ("interval", name))
@@ -95,7 +98,7 @@ def test_a_search_beats_even_steps(make_task: MakeTask, name: str) -> None:
 
 
 LEAST = {"deepcache": 24, "delta-dit": 15, "l2c": 30, "teacache": 12, "dbcache": 15}
-"""Cells of 10 x 6 that a strategy cannot do without; step 0 for the others."""
+"""Cells of 10 x 6 that a search cannot do without; step 0 for the others."""
 
 
 @pytest.mark.slow
@@ -103,9 +106,9 @@ LEAST = {"deepcache": 24, "delta-dit": 15, "l2c": 30, "teacache": 12, "dbcache":
 def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(make_task: MakeTask, name: str, least: int) -> None:
     sparsity = f"{1 - least / 60:.4g}"
     with pytest.raises(CalibrationError, match=rf"'{name}' computes at least {least} of the 10 x 6 .* of {sparsity};"):
-        open_search(name, make_task(least - 1))
+        row_of(name).search(make_task(least - 1))
     with pytest.raises(CalibrationError, match=f"leaves {least - 1}"):
-        strategy_of(name).require_reach(10, 6, least - 1)
+        row_of(name).require_reach(10, 6, least - 1)
     found = found_by(name, make_task(least))
     assert int((found.schedule == Source.COMPUTE).sum()) == least
 
@@ -118,40 +121,52 @@ def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
 
 
 def test_an_unknown_name_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-paper, interval"):
-        strategy_of("magic")
+    with pytest.raises(CalibrationError, match="some of schedule, tts-paper, interval, .* loops, .*; found 'magic'"):
+        rows_of(("schedule", "magic"))
+    with pytest.raises(CalibrationError, match="found none"):
+        rows_of(())
 
 
-def test_fewer_intervals_than_a_strategy_has(make_task: MakeTask) -> None:
+def test_fewer_intervals_than_a_search_has(make_task: MakeTask) -> None:
     task = make_task(BUDGET)
     assert found_by("evo", task, 2).notes == {"generations": 2}
     assert found_by("evo", task, 1000).notes == {"generations": 4}
 
 
-def test_names_are_given_once_and_the_first_is_the_default() -> None:
-    """Each with a maker, and with what it is from."""
-    assert len(set(NAMES)) == len(STRATEGIES)
-    assert all(one.make().__doc__ and one.source for one in STRATEGIES)
-    assert (DEFAULT, CORRECTING) == ("tts", ("tts",))
-    assert [one.name for one in STRATEGIES if one.baseline] == ["interval"]
+def test_names_are_given_once_and_one_of_them_makes_the_first_plan() -> None:
+    """Each row has a maker, and says what is learned, or what it is from."""
+    names = [row.name for row in PROPOSERS]
+    assert len(set(names)) == len(names)
+    assert all(row.what and pkgutil.resolve_name(f"ttscompile.{row.maker}").__doc__ for row in PROPOSERS)
+    assert [row.name for row in SCHEDULES if row.corrects] == ["schedule"]
+    assert [row.name for row in SCHEDULES if row.baseline] == ["interval"]
+    assert {row.name for row in PROPOSERS if row.anew} == {*NAMES, "loops"}
+    for two in (("schedule", "bac"), ("interval", "bac"), ("tts-paper", "loops")):
+        found = " and ".join(map(repr, two))
+        with pytest.raises(CalibrationError, match=f"one that makes the first plan; found {found}. Take one of them."):
+            rows_of((*reversed(two), "weights"))
 
 
-def test_a_name_without_a_maker_is_an_error() -> None:
+def test_they_propose_in_the_order_of_the_table() -> None:
+    assert [row.name for row in rows_of(("weights", "precision", "bac"))] == ["bac", "precision", "weights"]
+
+
+def test_a_name_without_a_maker_is_an_error(make_task: MakeTask) -> None:
     with pytest.raises(AttributeError, match="no attribute 'magic'"):
-        Strategy("magic", "none", "rivals.bac:magic").make()
+        ScheduleRow("magic", "nothing", "rivals.bac:magic").search(make_task(BUDGET))
     with pytest.raises(ModuleNotFoundError, match="magic"):
-        Strategy("magic", "none", "rivals.magic:magic").make()
+        ScheduleRow("magic", "nothing", "rivals.magic:magic").search(make_task(BUDGET))
 
 
 def test_the_table_is_read_without_torch() -> None:
-    code = "import sys, ttscompile.calibration.strategies; print(sorted({'numpy', 'torch'} & set(sys.modules)))"
+    code = "import sys, ttscompile.calibration.proposers; print(sorted({'onnx', 'torch'} & set(sys.modules)))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout == "[]\n"
 
 
-def test_nobody_asks_for_a_strategy_by_its_name() -> None:
-    """What depends on a strategy is a property of its record."""
-    asked = re.compile(rf"""(==|!=|\bin|\bcase) \(?["'](?:{"|".join(map(re.escape, NAMES))})["']""")
+def test_nobody_asks_for_a_rival_by_its_name() -> None:
+    """What depends on it is a property of its row."""
+    asked = re.compile(rf"""(==|!=|\bin|\bcase) \(?["'](?:{"|".join(re.escape(row.name) for row in RIVALS)})["']""")
     package = Path(ttscompile.__file__).parent
     found = [
         f"{path.relative_to(package)}:{number}: {line.strip()}"
@@ -160,5 +175,5 @@ def test_nobody_asks_for_a_strategy_by_its_name() -> None:
         if asked.search(line)
     ]
     assert found == []
-    assert asked.search('if strategy == "tts":')
-    assert asked.search('if strategy in ("sag", "l2c"):')
+    assert asked.search('if name == "tts-paper":')
+    assert asked.search('if name in ("sag", "l2c"):')
