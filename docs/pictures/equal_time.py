@@ -1,9 +1,9 @@
-"""Draws equal_time.png: how far strategies are from the original at equal milliseconds, and with our correction.
+"""Draws equal_time.png: how far schedules are from the original at equal milliseconds, and with our correction.
 
 python docs/pictures/equal_time.py [FILE]
 python docs/pictures/equal_time.py [FILE] "Meta-World=metaworld.json"
 
-It reads ``docs/evidence/equal_time.json``. The second command first puts there what ``examples/benchmark/strategies.py
+It reads ``docs/evidence/equal_time.json``. The second command first puts there what ``examples/benchmark/rivals.py
 --even-steps ... --correct --json`` printed of a policy, in the place of what was there of it. What fits a correction of
 its own is in both panels of a row.
 """
@@ -16,9 +16,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ttscompile.calibration.strategies import CORRECTING, NAMES
+from ttscompile.calibration.proposers import SCHEDULES
 from ttscompile.plots.figure import plain_powers, with_grid
 from ttscompile.plots.frontier import COLOURS, MARKERS
+
+CORRECTING = [one.name for one in SCHEDULES if one.corrects]
 
 SHADES = (*COLOURS, "#8c564b")
 
@@ -38,11 +40,11 @@ def rows_of(document: Mapping[str, Any]) -> list[dict[str, Any]]:
     for point in document["comparison"]["points"]:
         name, _, pace = point["name"].partition("-as-")  # of plans that a run before had written
         series = point["series"] if point["series"] != "this artifact" else name.replace("-corrected", ", corrected")
-        strategy, _, corrected = series.partition(", ")
+        proposer, _, corrected = series.partition(", ")
         share = document["shares"].get(point["series"], {}).get(point["name"])  # None of what was not held to a pace
         made.append(
             {
-                "strategy": strategy,
+                "proposer": proposer,
                 "corrected": bool(corrected),
                 "as": pace or name.removeprefix("as-"),
                 "reused": round(point["sparsity"], 4),
@@ -67,18 +69,18 @@ def keep(policy: str, document: Mapping[str, Any], table: Path = TABLE) -> None:
 
 
 def panel(axes: Any, rows: Rows, names: Sequence[str], corrected: bool) -> None:
-    """One way to run all strategies: a line for each, from the shorter calls to the longer ones."""
-    for number, strategy in enumerate(names):
-        wanted = corrected and strategy not in CORRECTING
+    """One way to run all proposers: a line for each, from the shorter calls to the longer ones."""
+    for number, name in enumerate(names):
+        wanted = corrected and name not in CORRECTING
         own = sorted(
             (row["ms"], max(row["distance"], NEAREST))
             for row in rows
-            if (row["strategy"], row["corrected"]) == (strategy, wanted)
+            if (row["proposer"], row["corrected"]) == (name, wanted)
         )
         if own:
             style: dict[str, Any] = {"marker": MARKERS[(number + number // len(SHADES)) % len(MARKERS)]}
-            style |= {"color": SHADES[number % len(SHADES)], "linewidth": 2.2 if strategy in CORRECTING else 1}
-            axes.plot(*zip(*own, strict=True), label=strategy, **style)
+            style |= {"color": SHADES[number % len(SHADES)], "linewidth": 2.2 if name in CORRECTING else 1}
+            axes.plot(*zip(*own, strict=True), label=name, **style)
     axes.set(xscale="log", yscale="log")
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
@@ -94,10 +96,10 @@ def draw(path: Path, table: Path = TABLE) -> None:
     figure = Figure(figsize=(9, 3.6 * len(policies) + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(policies), 2, squeeze=False, sharex="row", sharey="row")
-    known = {row["strategy"] for rows in policies.values() for row in rows}
-    names, named = [name for name in NAMES if name in known], dict[str, Any]()
+    known = {row["proposer"] for rows in policies.values() for row in rows}
+    names, named = [one.name for one in SCHEDULES if one.name in known], dict[str, Any]()
     for row, (policy, rows) in zip(grid, policies.items(), strict=True):
-        dense = next(each["ms"] for each in rows if each["strategy"] == "dense")
+        dense = next(each["ms"] for each in rows if each["proposer"] == "dense")
         for axes, (title, corrected) in zip(row, PANELS.items(), strict=True):
             panel(axes, rows, names, corrected)
             axes.set_title(f"{policy}, {title} (all steps: {dense:.3g} ms)", fontsize=9)
