@@ -164,6 +164,18 @@ def test_the_table_is_read_without_torch() -> None:
     assert result.stdout == "[]\n"
 
 
+@pytest.mark.slow
+def test_what_calibrates_without_a_rival_imports_none() -> None:
+    code = (
+        "import pkgutil, sys; from ttscompile.calibration import pipeline, proposers as those\n"
+        "for row in those.PROPOSERS:\n"
+        "    row in those.RIVALS or pkgutil.resolve_name('ttscompile.' + row.maker)\n"
+        "print('ttscompile.calibration.tts' in sys.modules, [n for n in sys.modules if 'ttscompile.rivals.' in n])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout == "True []\n"
+
+
 def test_nobody_asks_for_a_rival_by_its_name() -> None:
     """What depends on it is a property of its row."""
     asked = re.compile(rf"""(==|!=|\bin|\bcase) \(?["'](?:{"|".join(re.escape(row.name) for row in RIVALS)})["']""")
