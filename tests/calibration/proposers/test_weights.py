@@ -102,8 +102,8 @@ def test_people_are_told_that_it_is_another_network(distilled: Trained, schedule
     remarks = facts.remarks(record)
     assert f"Learned, weights: 9 matrices of blocks were trained in {UPDATES} updates." in remarks
     assert any("is another network" in remark for remark in remarks)
-    assert "--learn schedule,weights`" in card(artifact, "org/name", [], [], None)
-    assert "--learn" not in card(load_artifact(scheduled), "o/n", [], [], None)
+    assert "--learn interval,weights`" in card(artifact, "org/name", [], [], None)
+    assert "--learn interval`" in card(load_artifact(scheduled), "o/n", [], [], None)
 
 
 @pytest.mark.slow
