@@ -45,7 +45,7 @@ types: $(READY)
 	rm -rf $(TYPED)
 	mkdir -p $(TYPED)/recipes
 	cp -Rp ttscompile tests examples plugins/lerobot_policy_ttscompile $(TYPED)
-	cp -Rp passes runtimes plugins/hub plugins/policies plugins/rivals plugins/serving $(TYPED)/ttscompile
+	cp -Rp passes runtimes plugins/doctor plugins/hub plugins/policies plugins/rivals plugins/serving $(TYPED)/ttscompile
 	mv $(TYPED)/examples/policies/*.py $(TYPED)/recipes
 	cd $(TYPED) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache .
 

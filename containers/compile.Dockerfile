@@ -9,6 +9,7 @@ COPY CHANGELOG.md LICENSE MANIFEST.in README.md constraints.txt pyproject.toml .
 COPY ttscompile ttscompile
 COPY passes passes
 COPY runtimes runtimes
+COPY plugins/doctor plugins/doctor
 COPY plugins/hub plugins/hub
 COPY plugins/policies plugins/policies
 COPY plugins/rivals plugins/rivals

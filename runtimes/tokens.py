@@ -12,9 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ttscompile.artifact.manifest import MANIFEST, Manifest, PieceRecord
+from ttscompile.artifact.manifest import MANIFEST, Manifest
 from ttscompile.artifact.strict_json import REMEDY
-from ttscompile.artifact.towers import TokensRecord
 from ttscompile.core.coercion import Array
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import ArtifactError
@@ -134,27 +133,19 @@ class TokenTower:
 
     Args:
         name: of the piece.
-        pieces: with the piece that makes of a row what patches are cut from, and the piece for some tokens.
-        told: whether what is said in integers is the same as long as what is kept is of use.
-        run, renew: the first and the second of these.
+        run, renew: the piece that makes of a row what patches are cut from, and the piece for some tokens.
     """
 
-    def __init__(
-        self,
-        name: str,
-        pieces: Mapping[str, PieceRecord],
-        record: TokensRecord,
-        reuse: TokenReuse,
-        told: bool,
-        run: Run,
-        renew: Renew,
-    ) -> None:
+    def __init__(self, name: str, manifest: Manifest, reuse: TokenReuse, run: Run, renew: Renew) -> None:
         self._pixels, self._part, self._scene = pixels_name(name), tokens_name(name), name == SCENE
-        self._run, self._renew, self._record, self._reuse, self._told = run, renew, record, reuse, told
-        self._cut, self._reads = pieces[self._pixels].inputs, pieces[self._part].inputs
+        self._run, self._renew, self._record, self._reuse = run, renew, manifest.tokens[name], reuse
+        self._cut, self._reads = (manifest.pieces[piece].inputs for piece in (self._pixels, self._part))
         self._threshold = reuse.scene if self._scene else reuse.threshold
-        self._always = np.array([*range(record.fixed), *record.words], np.int64)
-        self._free = np.setdiff1d(np.arange(record.tokens), self._always) - record.fixed
+        self._always = np.array([*range(self._record.fixed), *self._record.words], np.int64)
+        self._free = np.setdiff1d(np.arange(self.tokens), self._always) - self._record.fixed
+        # A picture may be of integers; and words that hold a state are others in every call (``Instruct.other_task``).
+        words = manifest.spec.instruction
+        self._told = self._scene and (words is None or words.state is None)
         self._lanes: dict[Lane, Kept] = {}
 
     @property
@@ -223,7 +214,7 @@ class TokenTower:
             return np.arange(tokens), np.zeros(0, np.float32), work(refresh=tokens) if kept else work(first=tokens)
         off = self._differences(pixels, kept.pixels)
         changed = int(np.count_nonzero(off[free] > self._threshold))
-        if not changed:
+        if not changed and not off[[*self._record.words]].any():  # words may hold a state
             return np.arange(0), off, work()
         least = len(self._always)
         size = next((size for size in sizes_of(tokens) if size >= least + changed), tokens)
@@ -303,12 +294,7 @@ def token_towers(manifest: Manifest, reuse: TokenReuse | None, run: Run, renew: 
     """By piece, those that reuse tokens; none where ``reuse`` is None."""
     if reuse is None:
         return {}
-    words, towers = manifest.spec.instruction, dict[str, TokenTower]()
-    for name in reusing(manifest, reuse):
-        # A picture may be of integers; and words that hold a state are others in every call (``Instruct.other_task``).
-        told = name == SCENE and (words is None or words.state is None)
-        towers[name] = TokenTower(name, manifest.pieces, manifest.tokens[name], reuse, told, run, renew)
-    return towers
+    return {name: TokenTower(name, manifest, reuse, run, renew) for name in reusing(manifest, reuse)}
 
 
 def reusing(manifest: Manifest, reuse: TokenReuse | None) -> list[str]:

@@ -12,6 +12,7 @@ PACKAGES = {
     "ttscompile": "ttscompile",
     "passes": "ttscompile.passes",
     "runtimes": "ttscompile.runtimes",
+    "plugins/doctor": "ttscompile.doctor",
     "plugins/hub": "ttscompile.hub",
     "plugins/policies": "ttscompile.policies",
     "plugins/rivals": "ttscompile.rivals",

@@ -34,7 +34,7 @@ PROPOSERS: tuple[Row, ...] = (
         "calibration.proposers.precision:Precision",
         lowers=True,
     ),
-    Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
+    Row("tokens", "when a token of an encoder or of the scene is computed anew", "calibration.proposers.tokens:Tokens"),
     Row(
         "weights",
         "low-rank updates of later steps' weights",

@@ -18,9 +18,9 @@ from math import floor
 from pathlib import Path
 from typing import NamedTuple
 
-from ..core.finding import Finding, Level
-from ..measure.machine import BUSY, X86, cpuinfo
-from ..measure.versions import release
+from ttscompile.core.finding import Finding, Level
+from ttscompile.measure.machine import BUSY, X86, cpuinfo
+from ttscompile.measure.versions import release
 
 PYTHON = (3, 10)
 PROJECT = "ttscompile"

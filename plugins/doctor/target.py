@@ -11,13 +11,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.finding import Finding, Level
-from ..errors import NonFiniteActionsError, TtscompileError
+from ttscompile.core.finding import Finding, Level
+from ttscompile.errors import NonFiniteActionsError, TtscompileError
+
 from .machine import available_bytes
 
 if TYPE_CHECKING:
-    from ..artifact.load import Artifact
-    from ..core.spec import PolicySpec
+    from ttscompile.artifact.load import Artifact
+    from ttscompile.core.spec import PolicySpec
 
 PART, CHECKPOINT = "artifact", "checkpoint"
 CALLS = 5
@@ -28,7 +29,7 @@ _COPIES = 3
 def artifact_findings(directory: Path) -> list[Finding]:
     """Does it load here, does it fit, and does a call give finite actions, in which time; up to the first problem."""
     try:
-        from ..artifact.load import load_artifact
+        from ttscompile.artifact.load import load_artifact
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         remedy = f"Run: pip install {package}."
@@ -41,9 +42,9 @@ def artifact_findings(directory: Path) -> list[Finding]:
 
 
 def _needs(artifact: Artifact) -> list[Finding]:
-    from ..artifact.view import view_of
-    from ..measure.machine import has_integer_dot_product
-    from ..runtimes.liveness import rollout_needs
+    from ttscompile.artifact.view import view_of
+    from ttscompile.measure.machine import has_integer_dot_product
+    from ttscompile.runtimes.liveness import rollout_needs
 
     manifest, needs = artifact.manifest, artifact.manifest.requires
     written = f"schema {manifest.schema_version} of ttscompile {manifest.ttscompile_version}"
@@ -73,9 +74,9 @@ def _needs(artifact: Artifact) -> list[Finding]:
 
 
 def _call(artifact: Artifact) -> list[Finding]:
-    from ..runtimes.open import open_runtime
-    from ..runtimes.policy import CompiledPolicy
-    from ..runtimes.random_calls import random_call
+    from ttscompile.runtimes.open import open_runtime
+    from ttscompile.runtimes.policy import CompiledPolicy
+    from ttscompile.runtimes.random_calls import random_call
 
     try:
         policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
@@ -107,9 +108,9 @@ def target_findings(
 ) -> list[Finding]:
     """What ``convert`` takes or wrote, and whether recordings fit it; see there and ``load_trajectories``."""
     try:
-        from ..artifact.archive import is_checkpoint
-        from ..artifact.load import load_artifact
-        from ..trajectories.fits import examine_recordings
+        from ttscompile.artifact.archive import is_checkpoint
+        from ttscompile.artifact.load import load_artifact
+        from ttscompile.trajectories.fits import examine_recordings
 
         tokenizer = None
         if isinstance(target, str) or is_checkpoint(target):
@@ -129,9 +130,9 @@ def target_findings(
 
 
 def _checkpoint(target: Path | str) -> tuple[list[Finding], PolicySpec]:
-    from ..frontends import load_checkpoint_policy
-    from ..frontends.examined import examine
-    from ..hub import fetch_checkpoint
+    from ttscompile.frontends import load_checkpoint_policy
+    from ttscompile.frontends.examined import examine
+    from ttscompile.hub import fetch_checkpoint
 
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

@@ -12,7 +12,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from ..core.finding import Finding, Level
+from ttscompile.core.finding import Finding, Level
+
 from .machine import machine_findings, package_findings
 from .target import target_findings
 
