@@ -1,4 +1,4 @@
-"""What reusing tokens means, literally: every value of the tower is computed whole, and then most of it is thrown away.
+"""What reusing tokens means, literally: each value of a tower or scene is computed whole, and most of it thrown away.
 
 In a value that has a row for each token, the rows of tokens that are not computed are those that it had when they were,
 or those that a computed token has now. Which tokens these are is said patch by patch.
@@ -7,6 +7,7 @@ or those that a computed token has now. Which tokens these are is said patch by 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,7 @@ import torch
 from ttscompile.core.plan import TokenReuse
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import GETITEM, Graph, Ref
-from ttscompile.ir.tokens import find_tokens
+from ttscompile.ir.tokens import TokenStream, find_tokens
 
 Array = npt.NDArray[np.float32]
 EIGHTHS = (1, 2, 3, 4, 6, 8)
@@ -87,33 +88,88 @@ class LiteralChoice:
         assert all(gain[token] <= least + NEAR for token in others if token not in similar)
 
 
+class LiteralSceneChoice:
+    """Which tokens of a lane's scenes are computed: of a sequence of rows, some of which are words.
+
+    Args:
+        reuse: of the plan, with a share for scenes.
+        words: the tokens that no picture changes.
+    """
+
+    def __init__(self, reuse: TokenReuse, words: Collection[int]) -> None:
+        self.reuse, self.words = reuse, set(words)
+        self.shown = dict[int, Array]()  # by token, the row that it was last computed for
+        self.told: object = None
+        self.age = 0
+
+    def require(self, rows: Array, told: object, computed: Collection[int]) -> dict[str, int]:
+        """Raise AssertionError unless just these may be computed for rows ``[T, D]`` that say ``told``; and why."""
+        share, new, why = self.reuse.scene, dict(enumerate(rows)), ""
+        assert share is not None and len(set(computed)) == len(computed)
+        if self.shown:
+            why = "refresh" if self.age + 1 == self.reuse.refresh else ""
+        if not self.shown or told != self.told:
+            why = "first"
+        self.told = told
+        if why:
+            assert sorted(computed) == sorted(new)
+            self.shown, self.age = new, 0
+            return {why: len(new)}
+        self.age += 1
+        off = {token: self._off(row, self.shown[token]) for token, row in new.items() if token not in self.words}
+        changed = {token for token, much in off.items() if much > share}
+        if not changed:
+            assert not computed
+            return {}
+        always = self.words | changed
+        size = next(n for n in (-(-len(new) * eighths // 8) for eighths in EIGHTHS) if n >= len(always))
+        assert len(computed) == size
+        assert always <= set(computed), "and the next most changed"
+        left = [off[token] for token in off if token not in computed]
+        assert min(off[token] for token in off if token in computed) >= max(left, default=0) - NEAR
+        self.shown |= {token: new[token] for token in computed}
+        self.age = 0 if size == len(new) else self.age
+        return {"changed": len(changed), "filled": size - len(changed)}
+
+    @staticmethod
+    def _off(one: Array, other: Array) -> float:
+        """By which share of its numbers a row differs from another one."""
+        apart, size = (np.abs(each).mean(dtype=np.float64) for each in (one - other, other))
+        return 0.0 if apart == 0 else float(apart / max(size, 1e-30))
+
+
 class LiteralTokens:
-    """A tower of one frame after the other.
+    """A tower, or a scene, of one frame after the other.
 
     Args:
         tower: of a program.
         weights: of its constants.
+        stream: its tokens; None for those of a tower.
     """
 
-    def __init__(self, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> None:
-        stream = find_tokens(tower, weights)
-        assert not isinstance(stream, str)
-        self.tower, self.stream = tower, stream
+    def __init__(
+        self, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]], stream: TokenStream | None = None
+    ) -> None:
+        found = stream or find_tokens(tower, weights)
+        assert not isinstance(found, str)
+        self.tower, self.stream = tower, found
         self.weights = {name: torch.from_numpy(np.array(weights[name])) for name in tower.constants}
         self.kept: dict[str, torch.Tensor] = {}
 
     def __call__(
         self,
-        row: npt.NDArray[np.float32],
+        row: npt.NDArray[np.float32] | Mapping[str, npt.NDArray[Any]],
         computed: Sequence[int] | npt.NDArray[np.int64],
         similar: Mapping[int, int] | None = None,
     ) -> list[npt.NDArray[np.float32]]:
         """What the tower gives for a row ``[1, ...]``, of which these tokens are computed.
 
         Args:
+            row: of its input, or of each by name.
             similar: by token that is not computed, one that is, whose rows it gets; of the others it keeps them.
         """
-        values = {**self.weights, **{name: torch.from_numpy(row) for name in self.tower.inputs}}
+        rows = row if isinstance(row, Mapping) else dict.fromkeys(self.tower.inputs, row)
+        values = {**self.weights, **{name: torch.from_numpy(rows[name]) for name in self.tower.inputs}}
         chosen = torch.zeros(self.stream.tokens, dtype=torch.bool)
         chosen[torch.as_tensor(computed)] = True
         taken = torch.arange(self.stream.tokens)
@@ -127,7 +183,8 @@ class LiteralTokens:
                 assert isinstance(place, int)
                 value = several[source.name][place]
             else:
-                alone = Graph({name: types[name] for name in node.refs()}, {}, (node,), (node.name,))
+                one = node.resized(lambda batch: batch.multiple)  # of a row
+                alone = Graph({name: types[name] for name in node.refs()}, {}, (one,), (node.name,))
                 (value,) = evaluate(alone, {}, values)
             if isinstance(value, list | tuple):  # each of which is masked where it is taken
                 several[node.name] = value

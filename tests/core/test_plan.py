@@ -32,6 +32,37 @@ def test_a_threshold_is_a_number_that_is_not_negative(threshold: Any) -> None:
         TokenReuse(threshold, 8)
 
 
+@pytest.mark.parametrize("share", [math.nan, -1.0, -1, "a", True])
+def test_a_share_for_scenes_is_one_too(share: Any) -> None:
+    told = "scene of a plan's tokens: expected a number that is not negative; found "
+    with pytest.raises(IllegalPlanError, match=f"{told}{share!r}"):
+        TokenReuse(0.1, 8, scene=share)
+
+
+def test_without_a_share_scenes_are_whole() -> None:
+    """The one that is given is part of what a plan is, as is that none is."""
+    assert TokenReuse(0.1, 8).scene is None
+    assert TokenReuse(0.1, 8, np.float32(0.5)) == TokenReuse(0.1, 8, scene=0.5)  # type: ignore[arg-type]
+    assert type(TokenReuse(0.1, 8, np.float32(0.5)).scene) is float  # type: ignore[arg-type]
+    whole, some = (Plan(tokens=TokenReuse(0.1, 8, share)) for share in (None, 0.0))
+    assert whole != some and whole.variant != some.variant
+    assert whole.exact.tokens is some.exact.tokens is None
+
+
+@pytest.mark.parametrize(
+    ("reuse", "told"),
+    [
+        (None, ""),
+        (TokenReuse(0.1, 8), ", some tokens of each new frame"),
+        (TokenReuse(0.1, 8, 0.0), ", some tokens of each new frame and scene"),
+    ],
+)
+def test_a_plan_says_of_what_some_tokens_are_computed(reuse: TokenReuse | None, told: str) -> None:
+    assert Plan(tokens=reuse).in_words() == f"the steps of original that the pruner chooses{told}"
+    cells = np.zeros((5, 2), np.int8)
+    assert Plan(cells=cells, tokens=reuse).in_words() == f"5 of 5 steps of original{told}"
+
+
 @pytest.mark.parametrize("refresh", [0, -3, 1.5, math.nan, "8"])
 def test_a_refresh_is_a_count(refresh: Any) -> None:
     with pytest.raises(IllegalPlanError, match="refresh of a plan's tokens must be an integer of at least 1"):

@@ -19,7 +19,7 @@ from ttscompile.ir.verify import verify
 from ttscompile.lower.integer_convolution import DYNAMIC_PRODUCT
 from ttscompile.lower.precision import lower_precision, parts_to_lower
 from ttscompile.lower.program import lower_graphs
-from ttscompile.passes.split_frames import SplitFrames, _beside
+from ttscompile.passes.split_frames import SplitFrames, _beside, _parted
 
 LAYER = 2 * scenes.WIDTH * 8 * scenes.WIDTH
 """FLOPs of the products by constants of one row in one layer."""
@@ -141,3 +141,26 @@ def test_one_row_is_in_eight_bits_where_its_weights_are(when: When, rows: int) -
     assert len(products.get("condition", [])) == rows + (when == "last")
     assert {*products.get("condition", [])} <= {*products["scene"]}, "the same integers"
     assert {*products["scene"]} <= {*weights}
+
+
+def test_a_picture_that_is_handed_on_is_no_reason_to_compute_a_scene_again() -> None:
+    """It stays with what runs in every call. What is made of it is of the scene, as is what is handed on of words."""
+    shown, row = TensorType((Batch(), 1, 3, 4, 4), "float32"), TensorType((Batch(), 8), "float32")
+    features, flat = TensorType((Batch(), 2, 2, 2), "float32"), TensorType((Batch(), 8), "float32")
+    given = {"camera": shown, "other": shown, "seen.frame": features, "words": row, "state": row}
+    nodes = (
+        Node("copy", "aten.clone.default", (Ref("camera"),), (), (shown,)),
+        Node("again", "aten.clone.default", (Ref("other"),), (), (shown,)),
+        Node("twice", "aten.add.Tensor", (Ref("again"), Ref("again")), (), (shown,)),
+        Node("told", "aten.clone.default", (Ref("words"),), (), (row,)),
+        Node("rows", "aten.reshape.default", (Ref("seen.frame"), flat.shape), (), (flat,)),
+        Node("kept", "aten.clone.default", (Ref("seen.frame"),), (), (features,)),
+        Node("keys", "aten.add.Tensor", (Ref("rows"), Ref("words")), (), (row,)),
+        Node("late", "aten.add.Tensor", (Ref("state"), Ref("keys")), (), (row,)),
+    )
+    scene, rest = _parted(Graph(given, {}, nodes, ("copy", "twice", "told", "kept", "late")), ["state"])
+    assert "camera" not in scene.inputs
+    assert {"other", "seen.frame", "words"} == {*scene.inputs}
+    assert {"keys", "twice", "told", "kept"} <= {*scene.outputs}
+    assert set(rest.outputs) == {"copy", "late"}
+    assert {"state", "camera", "keys"} == {*rest.inputs}

@@ -364,7 +364,7 @@ def test_an_artifact_from_before_keeps_what_it_does_not_compute(artifact: Artifa
     pieces["tokens_00"] = replace(part, inputs=tuple(name for name in part.inputs if name not in (PLACES, ROWS)))
     before = replace(artifact.manifest, pieces=pieces)
     assert decode(encode(before)).pieces == pieces
-    image = picture(0)
+    image, (name,) = picture(0), pieces["frame_00"].inputs
 
     def run(piece: str, feed: Any) -> tuple[Array, ...]:
         return tuple(feed.values())
@@ -375,5 +375,17 @@ def test_an_artifact_from_before_keeps_what_it_does_not_compute(artifact: Artifa
 
     for manifest in (before, artifact.manifest):
         (tower,) = token_towers(manifest, REUSE, run, renew).values()
-        tower.compute(LANE, {"row": image[None]})
+        tower.compute(LANE, {name: image[None]})
     assert fed == [{PIXELS, INDEX}, {PIXELS, INDEX, PLACES, ROWS}]
+
+
+def test_a_picture_of_integers_is_no_instruction(artifact: Artifact) -> None:
+    """Another one is another frame of its lane, of which some tokens are computed; not the first one of another."""
+    before, (name,) = picture(0), artifact.manifest.pieces["frame_00"].inputs
+    shown = [(255 * image).astype(np.uint8)[None] for image in (before, moved(before, 3), moved(before, 3))]
+
+    def run(piece: str, feed: Any) -> tuple[Array, ...]:
+        return (feed[name] / np.float32(255),)
+
+    (tower,) = token_towers(artifact.manifest, REUSE, run, lambda *_: (before,)).values()
+    assert [tower.compute(LANE, {name: row})[1].computed for row in shown] == [TOKENS, 5, 0]

@@ -150,7 +150,7 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
             "loop": plan.loop,
             "weights": plan.weights,
             "precision": dict(sorted(plan.precision.items())),
-            "tokens": None if plan.tokens is None else {n: v for n, v in vars(plan.tokens).items() if v is not None},
+            "tokens": None if plan.tokens is None else dict(vars(plan.tokens)),
             "otherwise": otherwise,
         }
         if plan.cells is None:

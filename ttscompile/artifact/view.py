@@ -165,6 +165,9 @@ def _require(manifest: Manifest, variant: Variant) -> None:
     if variant.tokens is not None and variant.tokens.scene is not None and SCENE not in manifest.tokens:
         remedy = "Leave the scene out: TokenReuse(threshold, refresh)."
         raise IllegalPlanError(f"the scene of this policy, if it has one, has no tokens that could be reused. {remedy}")
+    if variant.tokens is not None and variant.tokens.scene is None and list(manifest.tokens) == [SCENE]:
+        remedy = "Say when they are computed: TokenReuse(threshold, refresh, scene=0.2)."
+        raise IllegalPlanError(f"only the scene of this policy has tokens that could be reused. {remedy}")
 
 
 def require_held(artifact: Artifact, plan: Plan) -> None:

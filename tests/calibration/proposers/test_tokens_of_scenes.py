@@ -63,9 +63,11 @@ def test_where_no_share_is_near_scenes_are_whole(trials: Trials, monkeypatch: py
 
 def test_a_scene_may_be_all_that_has_tokens(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = with_tokens(trials, {SCENE: trials.artifact.manifest.tokens[SCENE]})
-    limits = {TokenReuse(0.0, 6): 0.0, TokenReuse(0.0, 6, SCENES[-1]): NEAR}
     assert Tokens(request()).applies(alone.artifact) is None
-    assert tried(alone, monkeypatch, limits).plan.tokens == TokenReuse(0.0, 6, SCENES[-1])
+    found = tried(alone, monkeypatch, {TokenReuse(0.0, 6, SCENES[-1]): NEAR})
+    assert found.plan.tokens == TokenReuse(0.0, 6, SCENES[-1])
+    with pytest.raises(CalibrationFailedError, match="further off at least"):
+        tried(alone, monkeypatch, {})
 
 
 def test_too_many_tokens_are_refused_with_a_scene_too(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:

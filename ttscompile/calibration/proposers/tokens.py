@@ -47,13 +47,12 @@ class Tokens(Proposer):
         seen = max(last - first + 1 for _, first, last in trials.learned.stretches.tolist())
         refreshes = sorted({min(refresh, seen) for refresh in REFRESHES}, reverse=True)
         own = trials.artifact.manifest.tokens
-        thresholds = THRESHOLDS if set(own) - {SCENE} else THRESHOLDS[:1]
+        thresholds = THRESHOLDS if set(own) - {SCENE} else ()  # where whole frames are computed, only those of scenes
         settings = [TokenReuse(threshold, refresh) for refresh in refreshes for threshold in thresholds]
-        settings = settings if thresholds is THRESHOLDS else settings[:1]  # of whole frames none is a refresh
         scenes = SCENES if SCENE in own else ()
         all_tokens = replace(plan, tokens=None)
         if self.request.by_time:
-            fewest = TokenReuse(thresholds[-1], refreshes[0], *scenes[:1])
+            fewest = TokenReuse(THRESHOLDS[-1], refreshes[0], *scenes[:1])
             self._require_faster(trials, all_tokens, replace(plan, tokens=fewest))
         whole, tried = judge(trials, all_tokens, LEARNED), list[tuple[float, Score, TokenReuse]]()
         trials.bar.stage("settings of tokens", len(settings) + len(scenes))
@@ -73,20 +72,22 @@ class Tokens(Proposer):
             if try_one(setting)[0] > self.margin:
                 too_far[setting.refresh] = setting.threshold
         good = [(score, setting) for limit, score, setting in tried if limit <= self.margin]
+        # Of equals the smallest threshold, and the rarest refresh.
+        best = min(good, key=lambda one: one[0].tokens) if good else (whole, TokenReuse(0.0, refreshes[0]))
+        for share in clock.in_time(scenes if good or not settings else ()):  # of the rows that encoders give so
+            if try_one(replace(best[1], scene=share))[1] <= self.margin:
+                good = [best := tried[-1][1:]]
+                break
         if not good:
             least = min(limit for limit, _, _ in tried)
             raise _refused(f"the actions are {least:.3g} further off at least, and {self.margin:g} is allowed")
-        score, best = min(good, key=lambda one: one[0].tokens)  # of equals the smallest threshold, the rarest refresh
-        for share in clock.in_time(scenes):  # of the rows that encoders give so
-            if try_one(replace(best, scene=share))[1] <= self.margin:
-                _, score, best = tried[-1]
-                break
+        score, setting = best
         if (told := _too_many(score, {})) is not None:
             raise _refused(f"it {told}")
-        of = "new frames" + " and scenes" * (best.scene is not None)
+        of = "new frames" + " and scenes" * (setting.scene is not None)
         self.told = f"on the calls that it was chosen on, {score.tokens:.0%} of the tokens of {of} are computed"
-        notes, made = {**asdict(best), "computed": score.tokens}, replace(plan, tokens=best)
-        shared = {"tokens": best}
+        notes, made = {**asdict(setting), "computed": score.tokens}, replace(plan, tokens=setting)
+        shared = {"tokens": setting}
         yield Proposal(trials.changed_name, made, notes, margin=self.margin, shared=shared, refusal=_too_many)
 
     def _require_faster(self, trials: Trials, all_tokens: Plan, fewest: Plan) -> None:
