@@ -166,9 +166,8 @@ def main(
         one = Training(task, recipe)
         seconds = train(one, updates, minutes, progress.print)
         found = one.found()
-        head, correction = found.pruner or {}, one.correction
-        if correction is None:
-            correction = task.whole.correction_of(lambda calls: one.plans(calls, head))
+        head = found.pruner or {}
+        correction = task.whole.correction_of(lambda calls: one.plans(calls, head))  # that of the training is older
         named, plans = f"head, {training}'s training" + ", corrected" * corrected, one.plans(sets[1], head)
         rows = [judge(task, sets[1], noise, (named, direction), plans, each) for each in (None, correction)]
         rows = [replace(row, seconds=seconds, updates=one.done) for row in rows]

@@ -15,7 +15,7 @@ from gate_gradients import GateGradients
 from torch import Tensor
 
 from ttscompile.calibration.calls import Calls, calls_of
-from ttscompile.calibration.sparse_loop import fit_correction
+from ttscompile.calibration.sparse_loop import anchors_of, fit_correction
 from ttscompile.calibration.task import Found, Task
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source
@@ -229,8 +229,10 @@ class Training:
 
     def _correct(self) -> None:
         """Fit the correction to the plans that the head makes now."""
-        self.correction = fit_correction(self._task.runner, self.plans(self._fitted, self.priced()), self._fitted, True)
-        self._practice.runner = self._task.runner.corrected(self.correction)
+        task, plans = self._task, self.plans(self._fitted, self.priced())
+        reads = task.whole.reads(max(1, int(anchors_of(plans).sum())))  # as the correction of a found plan does
+        self.correction = fit_correction(task.runner, plans, self._fitted, reads)
+        self._practice.runner = task.runner.corrected(self.correction)
         self.loss, self.best = float("inf"), {}  # errors with another correction say nothing
 
     def found(self) -> Found:

@@ -266,9 +266,14 @@ def test_first_calls_are_dense_where_rollout_is_read(task: Task) -> None:
     assert later(training.compared).tolist() == [n for n in range(training.compared.count) if n % 4]
 
 
-def test_a_correction_is_fitted_again_on_the_way(task: Task) -> None:
+@pytest.mark.parametrize("reads", [True, False])
+def test_a_correction_is_fitted_again_on_the_way_as_calibrations_are(
+    task: Task, monkeypatch: pytest.MonkeyPatch, reads: bool
+) -> None:
+    monkeypatch.setattr(type(task.whole), "reads", lambda self, count: reads)
     training = trained(task, 9, corrected=True)
     assert training.correction is not None
+    assert bool(len(training.correction.observed)) == reads
     assert training._practice.runner.correction is training.correction
 
 
