@@ -15,7 +15,7 @@ from gate_gradients import GateGradients
 from torch import Tensor
 
 from ttscompile.calibration.calls import Calls, calls_of
-from ttscompile.calibration.sparse_loop import anchors_of, fit_correction
+from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.calibration.task import Found, Task
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source
@@ -230,7 +230,7 @@ class Training:
     def _correct(self) -> None:
         """Fit the correction to the plans that the head makes now."""
         task, plans = self._task, self.plans(self._fitted, self.priced())
-        reads = task.whole.reads(max(1, int(anchors_of(plans).sum())))  # as the correction of a found plan does
+        reads = task.whole.reads(max(1, task.budget // task.runner.model.blocks))  # as those of so many whole steps do
         self.correction = fit_correction(task.runner, plans, self._fitted, reads)
         self._practice.runner = task.runner.corrected(self.correction)
         self.loss, self.best = float("inf"), {}  # errors with another correction say nothing
