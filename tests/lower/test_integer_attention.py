@@ -143,6 +143,8 @@ def test_a_tower_and_its_form_for_some_tokens_have_it_both() -> None:
     kept = [make_tensor_value_info("k.kept", TensorProto.FLOAT, [FEWEST, 1, WIDTH]), *some.graph.input]
     del some.graph.input[:]
     some.graph.input.extend(kept)
+    some.graph.node.append(make_node("Identity", ["k.kept"], ["k.kept.new"]))
+    some.graph.output.append(make_tensor_value_info("k.kept.new", TensorProto.FLOAT, [FEWEST, 1, WIDTH]))
     made, _, _ = lower_precision({"frame_00": whole, "tokens_00": some}, WEIGHTS, "int8", ["frame_00"])
     for name in ("frame_00", "tokens_00"):
         assert HEADS in {node.op_type for node in made[name].graph.node}

@@ -84,10 +84,13 @@ def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: 
 
 
 def test_tokens_of_both_cameras_may_be_reused(compiled: Path) -> None:
-    """SigLIP and the connector behind it are one piece, whose tokens are found."""
-    manifest = load_artifact(compiled).manifest
-    assert {name: (one.tokens, one.fixed) for name, one in manifest.tokens.items()} == {"frame_00": (64, 0)}
-    assert set(CAMERAS) <= set(manifest.pieces["frames"].inputs)
+    """SigLIP and the connector behind it are one piece, whose tokens are found; and those of the language model."""
+    tokens = load_artifact(compiled).manifest.tokens
+    assert {name: (one.tokens, len(one.words)) for name, one in tokens.items()} == {
+        "frame_00": (64, 0),
+        "scene": (32, 24),
+    }
+    assert set(CAMERAS) <= set(load_artifact(compiled).manifest.pieces["frames"].inputs)
 
 
 def test_images_of_another_size_in_the_same_artifact(
