@@ -39,8 +39,8 @@ class Tokens(Proposer):
         """Whether an encoder, or the scene, has tokens."""
         if artifact.manifest.tokens:
             return None
-        problem = "no image encoder of this policy is a vision transformer, whose tokens could be reused, nor its scene"
-        return f"{problem}; 'ttscompile convert --explain' says of each encoder why"
+        problem = "no image encoder of this policy is a vision transformer whose tokens could be reused, and its scene"
+        return f"{problem} has none; 'ttscompile convert --explain' says why"
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """The plan, with the setting that computes the fewest tokens."""
