@@ -238,7 +238,10 @@ class CompiledPolicy:
             self._runtime.follow(executed)
 
     def forget_frames(self) -> None:
-        """Have the next call compute all of its frames, as if none had been seen: to measure what a call may take."""
+        """Have the next call compute all of its frames, as if none had been seen: to measure what a call may take.
+
+        Or where tokens of another task come, which hold a state (pi0.5): they do not tell that the task is another one.
+        """
         with self._turn():
             self._runtime.forget_frames()
 
@@ -307,7 +310,7 @@ class CompiledPolicy:
         streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)
         if self._instruct is not None and self._instruct.other_task():
-            self._runtime.frames.forget()
+            self._runtime.forget_frames()
         reference = spec.chunk.reference(obs)
         if prefix is not None:
             prefix = check_prefix(prefix, streams, spec, self.prefix_refusal(wanted), reference)

@@ -156,6 +156,6 @@ def test_a_policy_forgets_its_frames_where_it_is_told_so(once: Once, monkeypatch
         other_task = staticmethod(lambda: stub.other)
 
     monkeypatch.setattr(policy, "_instruct", Told())
-    for stub.other, expected in ((False, (1, 0)), (False, (0, 1)), (True, (1, 0))):
+    for stub.other, expected in ((False, (1, 0)), (False, (0, 1)), (True, (1, 0)), (False, (0, 1))):
         scenes.act(policy, scenes.observation())
         assert scenes.scenes(policy) == expected
