@@ -145,17 +145,32 @@ def test_where_words_hold_a_state_another_text_is_told_once(spec: Any, tmp_path:
         assert not plain.other_task()
 
 
+class Asked:
+    """In place of ``Instruct``: tokens are given, and ``other`` says whether the task is another one."""
+
+    other = False
+
+    def __call__(self, obs: Any) -> Any:
+        return obs
+
+    def other_task(self) -> bool:
+        return self.other
+
+
 def test_a_policy_forgets_its_frames_where_it_is_told_so(once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
-    policy = ttscompile.load(once.folder("scenes", scenes.compile_all) / "one", seed=0)
-    stub: Any = SimpleNamespace(other=False)
-
-    class Told:
-        def __call__(self, obs: Any) -> Any:
-            return obs
-
-        other_task = staticmethod(lambda: stub.other)
-
-    monkeypatch.setattr(policy, "_instruct", Told())
-    for stub.other, expected in ((False, (1, 0)), (False, (0, 1)), (True, (1, 0)), (False, (0, 1))):
+    policy, told = ttscompile.load(once.folder("scenes", scenes.compile_all) / "one", seed=0), Asked()
+    monkeypatch.setattr(policy, "_instruct", told)
+    for told.other, expected in ((False, (1, 0)), (False, (0, 1)), (True, (1, 0)), (False, (0, 1))):
         scenes.act(policy, scenes.observation())
         assert scenes.scenes(policy) == expected
+
+
+def test_so_do_all_plans_whichever_is_used(once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, told = once.folder("scenes of rows", scenes.compile_rows), Asked()
+    policy = ttscompile.load(folder / "rows", seed=0, plan="dense")
+    monkeypatch.setattr(policy, "_instruct", told)
+    some = replace(policy.plans["dense"], tokens=ttscompile.TokenReuse(0.0, 1000, 0.03))
+    calls = (False, some, 1), (False, some, 0), (False, None, 1), (True, None, 1), (False, some, 1)
+    for told.other, plan, computed in calls:
+        scenes.act(policy, scenes.observation(), plan)
+        assert scenes.scenes(policy)[0] == computed
