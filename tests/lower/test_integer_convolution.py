@@ -8,10 +8,11 @@ import pytest
 import torch
 from onnx import ModelProto, NodeProto, TensorProto
 from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
+from onnx.numpy_helper import from_array
 from torch.nn import functional
 
 from tests.lower.sessions import Array, session
-from ttscompile.lower.integer_convolution import LEAST
+from ttscompile.lower.integer_convolution import LEAST, shapes_of
 from ttscompile.lower.precision import quantize_matrix, quantize_model
 from ttscompile.measure.machine import has_integer_dot_product
 
@@ -98,3 +99,23 @@ def test_what_is_slower_or_unknown_stays_as_it_is(
     same, constants = quantize_model(model, weights)
     assert constants == {}
     assert same == model
+
+
+def test_a_size_that_is_divided_is_known() -> None:
+    """The number of streams, of an input with two rows for each: a mask that is a constant is expanded to it."""
+    nodes = [
+        make_node("Shape", ["x"], ["rows"], start=0, end=1),
+        make_node("Squeeze", ["rows"], ["number"]),
+        make_node("Div", ["number", "two"], ["streams"]),
+        make_node("Reshape", ["streams", "flat"], ["first"]),
+        make_node("Concat", ["first", "tokens"], ["shape"], axis=0),
+        make_node("Expand", ["mask", "shape"], ["masks"]),
+        make_node("Cast", ["masks"], ["y"], to=TensorProto.FLOAT),
+    ]
+    kept = [("two", np.array(2)), ("flat", np.array([-1])), ("tokens", np.array([5])), ("mask", np.ones((1, 5), bool))]
+    inputs, outputs = ([make_tensor_value_info(name, TensorProto.FLOAT, ["2*B", 3])] for name in "xy")
+    graph = make_graph(nodes, "g", inputs, outputs, [from_array(value, name) for name, value in kept])
+    model = make_model(graph, opset_imports=[make_opsetid("", 23)], ir_version=10)
+    before = model.SerializeToString()
+    assert shapes_of(model)["masks"] == (1, 5) and shapes_of(model, 4)["masks"] == (4, 5)
+    assert model.SerializeToString() == before

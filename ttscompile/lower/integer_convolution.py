@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from onnx import ModelProto, NodeProto, shape_inference
+from onnx import ModelProto, NodeProto, TensorProto, numpy_helper, shape_inference
 
 from ..core.coercion import Array
 from .graph_writer import GraphWriter
@@ -42,11 +42,36 @@ def shapes_of(model: ModelProto, size: int = 1) -> dict[str, tuple[int, ...]]:
                 axis.dim_value = int(axis.dim_param.partition("*")[0].replace("B", "1")) * size
     for value in alone.graph.output:  # they say the number of streams, too
         value.type.tensor_type.ClearField("shape")
+    _fold_sizes(alone)
     graph = shape_inference.infer_shapes(alone, data_prop=True).graph
     return {
         value.name: tuple(d.dim_value for d in value.type.tensor_type.shape.dim)
         for value in [*graph.value_info, *graph.input]
     }
+
+
+_FOLDED: Mapping[str, Callable[..., Any]] = {
+    "Div": np.floor_divide,
+    "Reshape": lambda size, shape: size.reshape(shape),
+    "Concat": lambda *sizes: np.concatenate(sizes),
+}
+
+
+def _fold_sizes(model: ModelProto) -> None:
+    """Put constants in place of sizes that are divided: inference does not follow B from an input of ``2*B`` rows."""
+    inputs = {value.name: [d.dim_value for d in value.type.tensor_type.shape.dim] for value in model.graph.input}
+    stored = (t for t in model.graph.initializer if t.data_type == TensorProto.INT64 and (t.raw_data or t.int64_data))
+    known = {tensor.name: numpy_helper.to_array(tensor) for tensor in stored}
+    for node in list(model.graph.node):
+        attributes = {each.name: each.i for each in node.attribute}
+        if node.op_type == "Shape" and all(inputs.get(node.input[0], [0])):
+            known[node.output[0]] = np.array(inputs[node.input[0]])[attributes.get("start", 0) : attributes.get("end")]
+        elif node.op_type == "Squeeze" and node.input[0] in known and known[node.input[0]].size == 1:
+            known[node.output[0]] = known[node.input[0]].reshape(())
+        elif node.op_type in _FOLDED and all(name in known for name in node.input):
+            known[node.output[0]] = np.asarray(_FOLDED[node.op_type](*(known[name] for name in node.input)))
+            model.graph.initializer.append(numpy_helper.from_array(known[node.output[0]], node.output[0]))
+            model.graph.node.remove(node)
 
 
 def integer_convolution(
