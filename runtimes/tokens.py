@@ -141,7 +141,8 @@ class TokenTower:
         self._run, self._renew, self._record, self._reuse = run, renew, manifest.tokens[name], reuse
         self._cut, self._reads = (manifest.pieces[piece].inputs for piece in (self._pixels, self._part))
         self._threshold = reuse.scene if self._scene else reuse.threshold
-        self._always = np.array([*range(self._record.fixed), *self._record.words], np.int64)
+        self._words = np.array(self._record.words, np.int64)
+        self._always = np.concatenate([np.arange(self._record.fixed), self._words])
         self._free = np.setdiff1d(np.arange(self.tokens), self._always) - self._record.fixed
         # A picture may be of integers; and words that hold a state are others in every call (``Instruct.other_task``).
         words = manifest.spec.instruction
@@ -214,7 +215,7 @@ class TokenTower:
             return np.arange(tokens), np.zeros(0, np.float32), work(refresh=tokens) if kept else work(first=tokens)
         off = self._differences(pixels, kept.pixels)
         changed = int(np.count_nonzero(off[free] > self._threshold))
-        if not changed and not off[[*self._record.words]].any():  # words may hold a state
+        if not changed and not off[self._words].any():  # words may hold a state
             return np.arange(0), off, work()
         least = len(self._always)
         size = next((size for size in sizes_of(tokens) if size >= least + changed), tokens)

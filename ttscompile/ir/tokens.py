@@ -70,15 +70,20 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
     if len(placed) < LEAST_TOKENS:
         return f"%{entry} has {len(placed)} tokens, fewer than {LEAST_TOKENS}"
     stream = TokenStream(pixels, entry, len(placed), fixed, _axes(tower, entry, len(placed)))
-    total, behind = graph_flops(tower), reachable_from(tower, {entry})
-    whole = [node for node in tower.nodes if node.name not in stream.axes]
-    cutting = sum(node_flops(node, types) for node in whole if node.name not in behind)
-    if cutting > MOST_WHOLE * total:
-        return f"cutting patches, up to %{entry}, is {cutting / total:.0%} of its FLOPs"
+    return _too_much(tower, stream, "cutting patches up to") or stream
+
+
+def _too_much(graph: Graph, stream: TokenStream, before: str) -> str | None:
+    """Why more than ``MOST_WHOLE`` is computed whatever changed; ``before`` says what comes before the entry."""
+    types, total, behind = graph.types(), graph_flops(graph), reachable_from(graph, {stream.entry})
+    whole = [node for node in graph.nodes if node.name not in stream.axes]
+    entering = sum(node_flops(node, types) for node in whole if node.name not in behind)
+    if entering > MOST_WHOLE * total:
+        return f"{before} %{stream.entry} is {entering / total:.0%} of its FLOPs"
     if sum(node_flops(node, types) for node in whole) > MOST_WHOLE * total:
         where = next(node for node in whole if stream.axes.keys() & set(node.refs()))
         return f"at %{where.name} ({where.op}) tokens come together otherwise than by attention"
-    return stream
+    return None
 
 
 def find_sequence(scene: Graph) -> TokenStream | str:
@@ -90,24 +95,21 @@ def find_sequence(scene: Graph) -> TokenStream | str:
         if not real or joined_axis(node) != 1 or not isinstance(tokens, int):
             continue
         entry = node.name
-        stream = TokenStream(entry, entry, tokens, 0, _axes(scene, entry, tokens))
-        total, behind = graph_flops(scene), reachable_from(scene, {entry})
+        stream, behind = (
+            TokenStream(entry, entry, tokens, 0, _axes(scene, entry, tokens)),
+            reachable_from(scene, {entry}),
+        )
         others = tuple(name for name in scene.outputs if name not in behind)
         cut, own = backward_slice(scene, scene.outputs, {entry: types[entry]}), backward_slice(scene, (entry,), {})
         read = {n: type_ for n, type_ in cut.inputs.items() if n not in {entry, *own.inputs}}
         read |= backward_slice(scene, others, {}).inputs
         beside = [name for name, type_ in read.items() if type_.dtype.startswith("float")]
-        whole = [node for node in scene.nodes if node.name not in stream.axes]
-        before = sum(node_flops(node, types) for node in whole if node.name not in behind)
         if tokens < LEAST_TOKENS:
             told = f"%{entry} has {tokens} tokens, fewer than {LEAST_TOKENS}"
         elif beside:
             told = f"what it gives depends on %{beside[0]} otherwise than by %{entry}"
-        elif before > MOST_WHOLE * total:
-            told = f"what makes %{entry} is {before / total:.0%} of its FLOPs"
-        elif sum(node_flops(node, types) for node in whole) > MOST_WHOLE * total:
-            where = next(node for node in whole if stream.axes.keys() & set(node.refs()))
-            told = f"at %{where.name} ({where.op}) tokens come together otherwise than by attention"
+        elif (much := _too_much(scene, stream, "what makes")) is not None:
+            told = much
         else:
             return stream
     return told
