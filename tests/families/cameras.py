@@ -212,3 +212,26 @@ def counted(policy: CompiledPolicy) -> tuple[int, int]:
     """Tokens that the last call computed, of how many."""
     assert policy.last_report is not None
     return policy.last_report.frames.tokens, policy.last_report.frames.of
+
+
+def happened(what: str, shown: list[Array], where: int, much: float) -> list[Array]:
+    """Two pictures after something has happened to the first, or to both."""
+    one, other = shown
+    rng = np.random.default_rng(where)
+    match what:
+        case "patch":
+            one = moved(one, where, much)
+        case "some":
+            for patch in rng.choice(36, size=1 + where % 20, replace=False):
+                one = moved(one, int(patch), much * rng.random())
+        case "light":
+            one, other = one + np.float32(much), other + np.float32(much)
+        case "noise":
+            one = one + np.float32(much) * rng.random(one.shape, np.float32)
+        case "shifted":
+            one = np.roll(one, where % SIDE, axis=where % 2 + 1)
+        case "cut":
+            one = picture(where)
+        case "swapped":
+            one, other = other, one
+    return [one, other]

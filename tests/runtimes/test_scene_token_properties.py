@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tests.families.cameras import CAMERAS, SIDE, moved, picture
+from tests.families.cameras import CAMERAS, happened, moved, picture
 from tests.families.scenes import compile_rows, observation, together
 from tests.literal_tokens import LiteralSceneChoice, LiteralTokens
 from tests.once import Once
@@ -134,29 +134,6 @@ def all_of_them(folder: Path) -> dict[Any, Literally]:
             for refresh in REFRESHES:
                 found[kind, (patch, share), refresh] = Literally(artifact, TokenReuse(patch, refresh, share))
     return found
-
-
-def happened(what: str, shown: list[Array], where: int, much: float) -> list[Array]:
-    """Two pictures after something has happened to the first, or to both."""
-    one, other = shown
-    rng = np.random.default_rng(where)
-    match what:
-        case "patch":
-            one = moved(one, where, much)
-        case "some":
-            for patch in rng.choice(36, size=1 + where % 20, replace=False):
-                one = moved(one, int(patch), much * rng.random())
-        case "light":
-            one, other = one + np.float32(much), other + np.float32(much)
-        case "noise":
-            one = one + np.float32(much) * rng.random(one.shape, np.float32)
-        case "shifted":
-            one = np.roll(one, where % SIDE, axis=where % 2 + 1)
-        case "cut":
-            one = picture(where)
-        case "swapped":
-            one, other = other, one
-    return [one, other]
 
 
 Story = st.lists(st.tuples(st.sampled_from(EVENTS), st.integers(0, 35), st.floats(0.0, 0.5, width=16)), max_size=8)

@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tests.families import cameras
-from tests.families.cameras import SIDE, act, counted, frame, moved, picture
+from tests.families.cameras import act, counted, frame, happened, moved, picture
 from tests.once import Once
 from ttscompile import Plan, TokenReuse
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
-from ttscompile.core.coercion import Array
 from ttscompile.core.plan import DENSE
 from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.load import open_policy
@@ -53,29 +52,6 @@ def all_frames(artifact: Artifact, literally: Literally) -> dict[tuple[float, in
             with artifact.reading():
                 found[threshold, refresh] = OnnxBackend(view_of(artifact, plan), sessions, {}).frames
     return found
-
-
-def happened(what: str, shown: list[Array], where: int, much: float) -> list[Array]:
-    """Two pictures after something has happened to the first, or to both."""
-    one, other = shown
-    match what:
-        case "patch":
-            one = moved(one, where, much)
-        case "some":
-            rng = np.random.default_rng(where)
-            for patch in rng.choice(36, size=1 + where % 20, replace=False):
-                one = moved(one, int(patch), much * rng.random())
-        case "light":
-            one, other = one + np.float32(much), other + np.float32(much)
-        case "noise":
-            one = one + np.float32(much) * np.random.default_rng(where).random(one.shape, np.float32)
-        case "shifted":
-            one = np.roll(one, where % SIDE, axis=where % 2 + 1)
-        case "cut":
-            one = picture(where)
-        case "swapped":
-            one, other = other, one
-    return [one, other]
 
 
 Story = st.lists(st.tuples(st.sampled_from(EVENTS), st.integers(0, 35), st.floats(0.0, 0.5, width=16)), max_size=8)
