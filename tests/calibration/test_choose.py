@@ -19,7 +19,7 @@ from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import least_bound
 from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.state import FILE
-from ttscompile.calibration.trials import Trials
+from ttscompile.calibration.trials import CONFIRMING, HELD_OUT, Trials
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.measure.timer import Times
@@ -33,14 +33,15 @@ def score_of(distance: float, limit: float | None = None) -> Score:
 
 
 def chosen(
-    monkeypatch: pytest.MonkeyPatch, trials: Trials, figures: Mapping[str, tuple[float, float, float]], **asked: float
+    monkeypatch: pytest.MonkeyPatch, trials: Trials, figures: Mapping[str, tuple[float, ...]], **asked: float
 ) -> Mapping[str, str]:
     """What the names of the artifact's plans were called while they were tried.
 
     Args:
         monkeypatch: fixture.
         trials: of any policy.
-        figures: distance, upper end of its interval, and milliseconds of plans by name.
+        figures: distance, upper end of its interval, and milliseconds of plans by name; and a fourth, that is warned
+            of, where it is further away on the calls that confirm it.
         asked: of ``Request``.
     """
     kept = Kept(trials, anew=True)
@@ -49,8 +50,9 @@ def chosen(
     names = {id(plan): name for name, plan in kept.plans.items()}
     figures = {DENSE: (0.0, 0.0, 100.0), **figures}
 
-    def scored(_: Trials, plan: Plan) -> Score:
-        distance, limit, _ms = figures[names[id(plan)]]
+    def scored(_: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
+        distance, limit, _ms, *confirmed = figures[names[id(plan)]]
+        distance = confirmed[0] if confirmed and part == CONFIRMING else distance
         return Score(distance, (0.0, limit), None, None, 0.0, 0.0, 0.0, 1)
 
     monkeypatch.setattr("ttscompile.calibration.choose.judge", scored)
@@ -61,7 +63,7 @@ def chosen(
     warned: list[str] = []
     monkeypatch.setattr(kept.trials.bar, "warn", warned.append)
     frontier = choose(kept, request(**asked))
-    assert len(warned) == (frontier.default == DENSE)
+    assert len(warned) == (frontier.default == DENSE) + sum(len(one) > 3 for one in figures.values())
     assert (DENSE in frontier.scores) == (frontier.default == DENSE)
     found = {name: names[id(plan)] for name, plan in frontier.plans.items() if name != DENSE}
     return found if frontier.default == "schedule" else {"kept": found.pop("schedule"), **found}
@@ -116,6 +118,29 @@ def test_what_may_cost_success_is_no_default_where_something_nearer_is_there(
     assert chosen(monkeypatch, trials, figures, deadline_ms=5.0, **bounds)["schedule"] == "c"
 
 
+def test_what_is_chosen_is_confirmed_by_other_calls(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    """What is further away there than it may be is not chosen; it may still be fast, as far as that may be."""
+    trials = trials_of(artifact, [recording])
+    figures: dict[str, tuple[float, ...]] = {
+        "a": (0.20, 0.25, 1.0),
+        "b": (0.08, 0.12, 2.0),
+        "c": (0.07, 0.1, 4.0),
+        "d": (0.01, 0.02, 9.0),
+    }
+    bounds = {"bound": 0.1, "farthest": 0.25}
+    assert chosen(monkeypatch, trials, figures, **bounds) == {"schedule": "b", "fast": "a", "safe": "d"}
+    unconfirmed = figures | {"b": (*figures["b"], 0.11)}
+    assert chosen(monkeypatch, trials, unconfirmed, **bounds) == {"schedule": "c", "fast": "a", "safe": "d"}
+    further = unconfirmed | {"a": (*figures["a"], 0.3)}
+    assert chosen(monkeypatch, trials, further, **bounds) == {"schedule": "c", "fast": "b", "safe": "d"}
+    unsafe = figures | {"d": (*figures["d"], 0.12)}
+    assert chosen(monkeypatch, trials, unsafe, **bounds) == {"schedule": "b", "fast": "a"}
+    with pytest.raises(CalibrationFailedError, match="surely within 0.1 of the original keeps 3 ms: the fastest, 'c'"):
+        chosen(monkeypatch, trials, unconfirmed, deadline_ms=3.0, **bounds)
+
+
 def test_nothing_that_may_cost_success_is_the_default_unasked(
     monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
 ) -> None:
@@ -161,7 +186,7 @@ def test_what_another_machine_may_choose_is_kept_beside(
     times = {DENSE: (0.0, 0.0, 100.0), **figures}
     monkeypatch.setattr(
         "ttscompile.calibration.choose.judge",
-        lambda _, plan: score_of(times[names[id(plan)]][0], times[names[id(plan)]][1]),
+        lambda _, plan, *__: score_of(times[names[id(plan)]][0], times[names[id(plan)]][1]),
     )
     monkeypatch.setattr(
         "ttscompile.calibration.choose.timed",
@@ -249,7 +274,7 @@ def test_by_a_deadline_the_nearest_are_timed_until_99_of_100_calls_are_known(
     kept.plans |= {name: replace(kept.trials.base) for name in ("late", "hiccup", "last")}
     names = {id(plan): name for name, plan in kept.plans.items()}
     far = {"late": 0.01, "hiccup": 0.02, "last": 0.03, DENSE: 0.0}
-    monkeypatch.setattr("ttscompile.calibration.choose.judge", lambda _, plan: score_of(far[names[id(plan)]]))
+    monkeypatch.setattr("ttscompile.calibration.choose.judge", lambda _, plan, *__: score_of(far[names[id(plan)]]))
 
     def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, calls: int = 16) -> list[Times]:
         rounds.append((len(entrants), calls))

@@ -19,6 +19,7 @@ from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.trials import (
+    CONFIRMING,
     DRAWS,
     FEWEST_OBSERVATIONS,
     HELD_OUT,
@@ -182,7 +183,8 @@ def test_episodes_of_other_lengths_count_alike() -> None:
 
 
 def test_one_split_and_every_answered_call_has_one_before_it(trials: Trials) -> None:
-    for part, numbers in ((LEARNED, trials.split.calibration), (HELD_OUT, trials.split.validation)):
+    parts = ((LEARNED, trials.split.calibration), *((one, trials.split.validation) for one in (HELD_OUT, CONFIRMING)))
+    for part, numbers in parts:
         sample = trials.sample(part)
         assert set(sample.episodes) <= set(numbers)
         assert sample.answers.shape == (len(sample.calls), DRAWS, policies.HORIZON, policies.CHANNELS)
@@ -193,6 +195,23 @@ def test_one_split_and_every_answered_call_has_one_before_it(trials: Trials) -> 
         assert (firsts < sample.calls[:, 1]).all()
         assert (sample.calls[:, 1] <= lasts).all()
     assert not set(trials.learned.episodes) & set(trials.held_out.episodes)
+
+
+def test_what_confirms_are_other_calls_of_the_held_out_episodes_with_other_noise(trials: Trials) -> None:
+    """Half as many at most. Of episodes that have too few others the same, with other noise."""
+    trials = replace(trials, observations=4, state=StateFile(None, {}), _samples={})
+    asked = {
+        part: {(int(one.stretches[s, 0]), int(row)) for s, row in one.calls}
+        for part in (HELD_OUT, CONFIRMING)
+        for one in (trials.sample(part),)
+    }
+    assert len(asked[CONFIRMING]) == 2 and not asked[CONFIRMING] & asked[HELD_OUT]
+    rows_of = [{key: rows[:2] for key, rows in one.observations.items()} for one in trials.episodes]
+    short = [replace(one, observations=rows) for one, rows in zip(trials.episodes, rows_of, strict=True)]
+    few = replace(trials, episodes=short, state=StateFile(None, {}), _samples={})
+    same, again = few.held_out, few.sample(CONFIRMING)
+    assert np.array_equal(same.calls, again.calls) and np.array_equal(same.stretches, again.stretches)
+    assert not np.isclose(same.answers, again.answers).any()
 
 
 @pytest.mark.parametrize(("fits", "drawn"), [(10, 16), (30, 30), (1000, 64)])

@@ -19,7 +19,7 @@ from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.proposer import Proposal, Proposer
 from ttscompile.calibration.proposers import rows_of
-from ttscompile.calibration.trials import LEARNED, Trials
+from ttscompile.calibration.trials import CONFIRMING, HELD_OUT, LEARNED, Trials
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import CalibrationFailedError
@@ -89,20 +89,21 @@ def test_time_is_left_for_eight_bits_and_for_timing_all(trials: Trials) -> None:
     rounds, dense, tried = WARM_UP + TIMED, 0.029, 3 * calls(trials, LEARNED) * 0.008
     assert seconds_to_judge_others(kept, lowers=True) == pytest.approx(calls(trials) * 0.013 + tried)
     assert seconds_to_judge_others(kept, lowers=False) == pytest.approx(calls(trials) * 0.013)
-    assert seconds_to_time(kept, None) == pytest.approx(2 * rounds * (dense + 0.013))
+    confirming = calls(trials, CONFIRMING) * (dense + 0.013)  # of three plans at most, those that take longest
+    assert seconds_to_time(kept, None) == pytest.approx(2 * rounds * (dense + 0.013) + confirming)
     # By a deadline two plans are called 200 times. The machine may be slower than it was.
     trials.clock.paces[True] = 3.0
-    assert seconds_to_time(kept, 50.0) == pytest.approx(3 * 2 * rounds * (dense + 0.013) + 2 * 200 * 0.05)
+    assert seconds_to_time(kept, 50.0) == pytest.approx(3 * 2 * rounds * (dense + 0.013) + 2 * 200 * 0.05 + confirming)
     kept.judged, kept.scores = dict(kept.plans), dict.fromkeys(kept.plans, score_of(0.1))
     assert seconds_to_judge_others(kept, lowers=False) == 0
 
 
 def test_nothing_is_judged_twice(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither what was judged before it got eight bits, nor the original, which is 0 away from itself."""
-    asked, kept = list[Plan](), Kept(trials, anew=True)
+    asked, confirmed, kept = list[Plan](), list[Plan](), Kept(trials, anew=True)
 
-    def judged(_: Trials, plan: Plan, *__: object) -> Score:
-        asked.append(plan)
+    def judged(_: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
+        (confirmed if part == CONFIRMING else asked).append(plan)
         return score_of(0.05 if plan.precision else 0.04)
 
     monkeypatch.setattr(choosing, "judge", judged)
@@ -117,6 +118,7 @@ def test_nothing_is_judged_twice(trials: Trials, monkeypatch: pytest.MonkeyPatch
     kept.consider(Proposal("two", replace(first, precision=INT8), margin=float("inf"), shared={"precision": INT8}))
     frontier = choose(kept, request(bound=0.1))
     assert [(plan.cells is other.cells, bool(plan.precision)) for plan in asked[2:]] == [(False, True), (True, True)]
+    assert confirmed == [frontier.plans[name] for name in ("schedule",)]
     distances = {row["name"]: row["distance"] for row in frontier.tried}
     assert distances[DENSE] == 0 and sorted(distances.values()) == [0, 0.04, 0.04, 0.05, 0.05]
     assert kept.known("three", replace(other, correction=None, cells=first.cells)) is None, "another plan"
@@ -135,7 +137,8 @@ def test_what_there_is_no_time_to_judge_is_left_out_by_name(trials: Trials, monk
     frontier = choose(kept, request(bound=0.1))
     assert {row["name"] for row in frontier.tried} == {DENSE, "schedule", "two"}
     assert frontier.plans["schedule"].cells is other.cells and not frontier.plans["schedule"].precision
-    assert trials.clock.left_out == ["2 of 10 steps of original", "3 of 10 steps of original, int8 in blocks"]
+    left = ["2 of 10 steps of original", "3 of 10 steps of original, int8 in blocks", "confirming 'three'"]
+    assert trials.clock.left_out == left and not any("confirmed" in row for row in frontier.tried)
 
 
 class Silent(Proposer):

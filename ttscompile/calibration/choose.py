@@ -1,6 +1,7 @@
 """Which of the plans that were kept is the default: all of them judged and timed, in one run."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +18,7 @@ from .kept import Kept
 from .proposer import SAFER, Request, least_bound
 from .proposers.loops import too_far, would_help
 from .step_counts import FAST, SAFE
-from .trials import LEARNED
+from .trials import CONFIRMING, LEARNED
 
 TIMED_LONG = 200
 """Calls of a plan that may be the default by a deadline: their 99th percentile has to keep it."""
@@ -27,6 +28,10 @@ SMALL = 0.05
 is small beside its corrections may take a tenth."""
 
 
+CHOSEN = 3
+"""Plans that get a name, and are confirmed: the default, ``safe`` and ``fast``."""
+
+
 @dataclass(frozen=True)
 class Frontier:
     """What was tried, and what was chosen.
@@ -34,8 +39,9 @@ class Frontier:
     Attributes:
         tried: all plans, fastest first, the original among them; JSON. ``name`` is that in the artifact, or what it was
             called while it was tried; ``told`` what it does, in words; ``distance`` and ``interval`` how far it is from
-            the original on held-out episodes, with 95 % limits (``judge``), and ``within`` the least bound that allows
-            that; ``milliseconds`` and ``worst`` the median and ``Times.worst`` of its ``calls`` on this machine, in
+            the original on held-out episodes, with 95 % limits (``judge``), ``within`` the least bound that allows
+            that, and ``confirmed`` the first two on other calls of these episodes, for what was chosen;
+            ``milliseconds`` and ``worst`` the median and ``Times.worst`` of its ``calls`` on this machine, in
             milliseconds; ``weights`` the bytes of those that its models read; ``near`` whether it is within
             ``Request.farthest``; ``kept`` whether the artifact gets it, and ``spare`` whether it does so for other
             machines.
@@ -62,12 +68,13 @@ def seconds_to_judge_others(kept: Kept, lowers: bool) -> float:
 
 
 def seconds_to_time(kept: Kept, deadline_ms: float | None) -> float:
-    """That timing takes: all plans in each precision, and by a deadline two for longer."""
+    """That timing takes: all plans in each precision, by a deadline two for longer; and to confirm what is chosen."""
     trials = kept.trials
     rounds = (WARM_UP + TIMED) * (1 if trials.artifact.manifest.precision is None else 2)
     slower = max(1.0, trials.clock.paces.get(True, 1.0))  # than when the loops were timed
     a_round = sum(call_seconds(trials, plan) for name, plan in kept.plans.items() if name != FULL)
-    return slower * rounds * a_round + 2 * TIMED_LONG * (deadline_ms or 0.0) / 1e3
+    confirming = sorted(seconds_to_judge(trials, plan, CONFIRMING) for name, plan in kept.plans.items() if name != FULL)
+    return slower * rounds * a_round + 2 * TIMED_LONG * (deadline_ms or 0.0) / 1e3 + sum(confirming[-CHOSEN:])
 
 
 def choose(kept: Kept, request: Request) -> Frontier:
@@ -76,28 +83,40 @@ def choose(kept: Kept, request: Request) -> Frontier:
     ``schedule`` is ``best_plan`` of those within ``Request.bound``, which are near enough, and the default; if there
     is none, it is the nearest within ``Request.farthest``, and ``dense`` the default. ``safe`` is the fastest that is
     near enough and a good deal nearer, and ``fast`` the fastest within ``Request.farthest``, where it saves more than
-    what counts as equally fast. What else may be it on another machine, or by another deadline, is kept as spare.
+    what counts as equally fast. What was chosen is confirmed by calls that it was not chosen by: where it is further
+    away than it may be on these, the next one is taken. What else may be it on another machine, or by another deadline,
+    is kept as spare.
 
     Raises:
         CalibrationFailedError: no plan is within ``Request.farthest``; or none that is near enough keeps the deadline,
             nor does ``dense``.
     """
-    entrants = _Entrants(kept, request)
-    times, distances, scores, within = entrants.times, entrants.distances, entrants.scores, entrants.within
-    allowed, close = ([n for n in within if within[n] <= bound] for bound in (request.farthest, request.bound))
+    entrants, bound, farthest = _Entrants(kept, request), request.bound, request.farthest
+    scores, within = entrants.scores, entrants.within
     if not within:  # there was no time for any
         return Frontier(entrants.rows({}, (), ()), {DENSE: kept.plans[DENSE]}, {}, {DENSE: scores[DENSE]}, DENSE)
-    if not allowed:
-        name = min(within, key=lambda n: scores[n].interval[1])
-        raise CalibrationFailedError(too_far(kept.trials, request, name, scores[name]))
-    chosen, default = entrants.best(close), SCHEDULE
+    chosen, default = entrants.confirmed(bound, entrants.best), SCHEDULE
     if chosen is None:
-        chosen, default = entrants.nearest(allowed, close), DENSE
-    named, took = {chosen: SCHEDULE}, times[chosen].median
-    if nearer := [n for n in close if times[n].median > took and distances[n] <= SAFER * distances[chosen]]:
-        named[min(nearer, key=lambda name: times[name].median)] = SAFE
-    if faster := {name: times[name].median for name in allowed if ALIKE * times[name].median < took}:
-        named[fastest(faster, distances)] = FAST
+        if not (allowed := entrants.near(farthest)):
+            name = min(within, key=lambda n: scores[n].interval[1])
+            raise CalibrationFailedError(too_far(kept.trials, request, name, scores[name]))
+        chosen, default = entrants.nearest(allowed, entrants.near(bound)), DENSE
+        entrants.holds(chosen, math.inf)
+    named, took = {chosen: SCHEDULE}, entrants.median(chosen)
+    distance = entrants.distances[chosen]
+
+    def nearer(close: Sequence[str]) -> str | None:
+        slower = [n for n in close if entrants.median(n) > took and entrants.distances[n] <= SAFER * distance]
+        return min(slower, key=entrants.median, default=None)
+
+    def faster(allowed: Sequence[str]) -> str | None:
+        times = {name: entrants.median(name) for name in allowed if ALIKE * entrants.median(name) < took}
+        return fastest(times, entrants.distances) if times else None
+
+    for name, most, pick in ((SAFE, bound, nearer), (FAST, farthest, faster)):
+        if (found := entrants.confirmed(most, pick)) is not None:
+            named[found] = name
+    allowed = entrants.near(farthest)
     plans = {DENSE: kept.plans[DENSE], **{named[name]: entrants.plans[name] for name in named}}
     spare = entrants.spare(named, allowed)
     others = [plan.otherwise for plan in (*plans.values(), *spare.values())]
@@ -136,10 +155,49 @@ class _Entrants:
         bar.stage("timing", 1)
         each = timed([(self._trials, plan) for plan in self.plans.values()], request.threads)
         self.times = dict(zip(self.plans, each, strict=True))
+        clock.ahead.clear()
+        self._confirmed = dict[str, Score]()
+        self._measured()
+
+    def _measured(self) -> None:
         self.distances = {name: one.distance for name, one in self.scores.items()}
         self.within = {n: least_bound(one.distance, one.interval) for n, one in self.scores.items() if n != DENSE}
 
-    def best(self, names: Iterable[str]) -> str | None:
+    def near(self, bound: float) -> list[str]:
+        """Names of the plans that are surely within a bound."""
+        return [name for name, least in self.within.items() if least <= bound]
+
+    def median(self, name: str) -> float:
+        """Milliseconds of a call."""
+        return self.times[name].median
+
+    def confirmed(self, bound: float, pick: Callable[[Sequence[str]], str | None]) -> str | None:
+        """What is picked of the plans within a bound, and holds; until one does, or none is left."""
+        while (name := pick(self.near(bound))) is not None and not self.holds(name, bound):
+            pass
+        return name
+
+    def holds(self, name: str, bound: float) -> bool:
+        """Whether a plan is within a bound on calls that it was not chosen by; if not, these say how far it is.
+
+        Where there is no time to ask, it is as near as it seemed.
+        """
+        if name == DENSE:
+            return True
+        if (found := self._confirmed.get(name)) is None:
+            seconds = seconds_to_judge(self._trials, self.plans[name], CONFIRMING)
+            if not self._trials.clock.has(seconds, f"confirming {name!r}"):
+                return True
+            found = self._confirmed[name] = judge(self._trials, self.plans[name], CONFIRMING)
+        if found.distance <= bound:
+            return True
+        words = f"{name!r} is {self.distances[name]:.3g} from the original on the calls that it was chosen by, and"
+        self._trials.bar.warn(f"{words} {found.distance:.3g} on others: more than {bound:g}, so it is not chosen.")
+        self.scores[name] = found
+        self._measured()
+        return False
+
+    def best(self, names: Sequence[str]) -> str | None:
         """``best_plan`` of these; by a deadline the nearest are timed long enough to tell, two at a time."""
         if (deadline := self._request.deadline_ms) is None:
             return best_plan({name: self.times[name] for name in names}, self.distances, None)
@@ -209,6 +267,7 @@ class _Entrants:
                 "distance": self.distances[name],
                 "interval": list(self.scores[name].interval),
                 "within": self.within.get(name, 0.0),
+                **self._second(name),
                 "milliseconds": times.median,
                 "worst": times.worst,
                 "calls": len(times.ms),
@@ -219,6 +278,11 @@ class _Entrants:
             }
             for name, times in sorted(self.times.items(), key=lambda one: one[1].median)
         )
+
+    def _second(self, name: str) -> dict[str, Any]:
+        if (one := self._confirmed.get(name)) is None:
+            return {}
+        return {"confirmed": {"distance": one.distance, "interval": list(one.interval)}}
 
 
 def _variants(name: str, plan: Plan) -> dict[str, Plan]:

@@ -36,7 +36,7 @@ from .recordings import warn_of_recordings
 from .schedule import FINISHED, TIME_LIMIT, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
-from .trials import LEARNED, Trials, base_of
+from .trials import CONFIRMING, LEARNED, Trials, base_of
 
 
 @dataclass(frozen=True)
@@ -302,8 +302,9 @@ def calibrate(
 def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock: Clock, request: Request) -> None:
     """Have each proposer judged, in its share of the time. Raises CalibrationFailedError: nothing was kept."""
     takes = np.cumsum([row.takes for row in rows])
-    if request.by_time and len(rows) > 1:
-        kept.trials.sample(LEARNED)  # what others choose on is answered first: so nobody has to leave time for it
+    if request.by_time:  # what others choose on is answered first: so nobody has to leave time for it
+        for part in (LEARNED, CONFIRMING)[len(rows) == 1 :]:
+            kept.trials.sample(part)
     for number, (row, proposer, share) in enumerate(zip(rows, proposers, takes / takes[-1], strict=True)):
         if request.by_time:
             clock.ahead[:] = [partial(seconds_to_time, kept, request.deadline_ms)]

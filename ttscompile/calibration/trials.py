@@ -44,14 +44,11 @@ paired. Where two plans answer alike the error of an energy distance falls as th
 of that of observations. So a small network is asked more often, up to the third."""
 
 OBSERVATIONS = 32
-"""That the original answers, at most, of either part; with further loops half as many of what is learned from, since
-only precisions and tokens are chosen on that."""
+"""That the original answers, at most, of either part; half as many that confirm, and of what is learned from with
+further loops, since only precisions and tokens are chosen on that."""
 
 FEWEST_OBSERVATIONS = 4
 """That it answers whatever the time."""
-
-JUDGING = 0.15
-"""Share of the time limit for the answers of either part that plans are judged by. A slow policy gives fewer."""
 
 QUICKLY, MORE_DRAWS = 0.7, 0.03
 """Share of the time for calls to learn from in which a small network answers more than usual, and of the time limit for
@@ -67,10 +64,15 @@ EPISODES = 16
 STRETCH = 32
 """Consecutive calls of an episode that they are among, at most: a plan that goes on from call to call makes all."""
 
-LEARNED, HELD_OUT, ELSEWHERE = "learned", "held out", "elsewhere"
-"""The two parts of the episodes, to learn from and to judge on; and calls of another episode before those of a part."""
+LEARNED, HELD_OUT, ELSEWHERE, CONFIRMING = "learned", "held out", "elsewhere", "confirming"
+"""The two parts of the episodes, to learn from and to judge on; calls of another episode before those of a part; and
+further calls of the held-out episodes. A plan that was chosen among many looks nearer than it is on the calls that it
+was chosen by: these confirm it."""
 
-_NUMBERS = {LEARNED: 0, HELD_OUT: 1, ELSEWHERE: 2}
+_NUMBERS = {LEARNED: 0, HELD_OUT: 1, ELSEWHERE: 2, CONFIRMING: 3}
+
+JUDGING = {LEARNED: 0.15, HELD_OUT: 0.15, CONFIRMING: 0.05}
+"""Share of the time limit for the answers of each part that plans are judged by. A slow policy gives fewer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,9 +253,10 @@ class Trials:
         """The answered calls of a part; answered when they are first asked for."""
         if part not in self._samples:
             numbers = self.split.calibration if part == LEARNED else self.split.validation
-            half = part == LEARNED and bool(self.artifact.manifest.spec.loops)
+            half = part == CONFIRMING or (part == LEARNED and bool(self.artifact.manifest.spec.loops))
             most = max(self.observations // (1 + half), 1)
-            stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), most)
+            judged = self.held_out if part == CONFIRMING else None
+            stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), most, judged)
             draws = self._draws(part, len(calls))
             calls = self._in_time(part, stretches, calls, draws)
             self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls, draws))
@@ -295,7 +298,7 @@ class Trials:
         if key not in self.state.progress:
             self._answers(part, stretches, calls[:1], draws)
             took = max(self.clock.elapsed() - begun, 1e-9)
-            found = min(JUDGING * self.clock.limit / took, len(calls))
+            found = min(JUDGING[part] * self.clock.limit / took, len(calls))
             self.state.progress[key] = max(int(found), min(FEWEST_OBSERVATIONS, len(calls)))
             if self.state.progress[key] < len(calls):
                 self.bar.warn(
@@ -344,9 +347,12 @@ def base_of(artifact: Artifact) -> Plan:
 
 
 def _places(
-    episodes: Sequence[Episode], numbers: Sequence[int], seed: tuple[int, ...], most: int
+    episodes: Sequence[Episode], numbers: Sequence[int], seed: tuple[int, ...], most: int, but: Sample | None
 ) -> tuple[IntArray, IntArray]:
-    """Stretches, and calls among them, as ``Sample`` has them: evenly over the episodes, at most so many calls."""
+    """Stretches, and calls among them, as ``Sample`` has them: evenly over the episodes, at most so many calls.
+
+    Of an episode that has half as many others at least, none of a sample.
+    """
     draw = np.random.default_rng(seed)
     chosen = np.sort(draw.permutation(np.array(numbers))[: min(EPISODES, most)])
     stretches, calls = [], []
@@ -355,6 +361,11 @@ def _places(
         first = int(draw.integers(episodes[number].calls - length + 1))
         last = first + length - 1
         stretches.append((number, first, last))
-        rows = np.linspace(min(first + 1, last), last, most // len(chosen)).round()
+        count, may = most // len(chosen), np.arange(min(first + 1, last), last + 1)
+        rows = np.linspace(may[0], last, count).round()
+        if but is not None:
+            others = np.setdiff1d(may, but.calls[but.episodes == number, 1])
+            if 2 * len(others) >= count:
+                rows = others[np.linspace(0, len(others) - 1, count).round().astype(np.int64)]
         calls += [(stretch, int(row)) for row in np.unique(rows)]
     return np.array(stretches, np.int64), np.array(calls, np.int64)

@@ -69,7 +69,9 @@ def print_frontier(
     record, default = artifact.manifest.calibration or {}, artifact.manifest.default_plan
     rows = record["frontier"]
     dense = next(row for row in rows if row["name"] == DENSE)
-    made = table("plan", "what it does", "ms a call", "longest", "times faster", "MB", "distance", "95 %", "")
+    made = table(
+        "plan", "what it does", "ms a call", "longest", "times faster", "MB", "distance", "95 %", "confirmed", ""
+    )
     for row in rows:
         made.add_row(
             f"{row['name']} (default)" if row["name"] == default else row["name"],
@@ -80,6 +82,7 @@ def print_frontier(
             f"{row['weights'] / 1e6:.1f}",
             f"{round(row['distance'], 3) + 0:.3f}",  # + 0: never -0
             "..".join(f"{round(one, 3) + 0:.3f}" for one in row["interval"]),
+            f"{round(row['confirmed']['distance'], 3) + 0:.3f}" if "confirmed" in row else "",
             "" if row["near"] else "too far",
         )
     made.columns[1].justify = "left"
@@ -101,7 +104,8 @@ def print_frontier(
         "Times faster: than the same policy with every step computed, compiled too. MB: of weights that its models"
         " read; a process takes more. Distance: between the actions and"
         " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
-        f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
+        f" {len(record['episodes']['validation'])}. Confirmed: on other calls of these, by which nothing was"
+        f" chosen. One stream, {threads} thread{'s' * (threads > 1)}.",
         *facts.told_spare(artifact.manifest),
         *((*facts.chosen(record), *facts.learned(record)) if record.get("other_noise") else facts.remarks(record)),
         "",

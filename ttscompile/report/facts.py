@@ -285,7 +285,8 @@ def chosen(record: Mapping[str, Any]) -> tuple[str, ...]:
     rows, asked = {row.get("name"): row for row in tried}, record.get("budget", {})
     if (row := rows.get(SCHEDULE if default == DENSE else default)) is None:
         return ()
-    told = f"{row['told']}: {row['distance']:.2g} of what other noise changes, {max(row['interval']):.2g} at worst"
+    found = row.get("confirmed", row)  # by calls that it was not chosen by, since builds do that
+    told = f"{row['told']}: {found['distance']:.2g} of what other noise changes, {max(found['interval']):.2g} at worst"
     longest = f"{ms(row['worst'])} at {'worst' if row.get('calls', 0) < MANY else 'the 99th percentile'}"
     longest += "" if (deadline := asked.get("latency_ms")) is None else f" of {deadline:.3g} allowed"
     times = f"{ms(row['milliseconds'])} ms a call on the machine that built it, {longest}"
