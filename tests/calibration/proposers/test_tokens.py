@@ -100,6 +100,18 @@ def test_a_build_tries_no_setting_where_none_makes_a_call_faster(
     Tokens(request(by_time=True, deadline_ms=9.5))._require_faster(trials, trials.base, trials.base)  # a tenth may do
 
 
+@pytest.mark.parametrize("slower", [False, True])
+def test_a_calibration_says_that_a_call_becomes_slower(
+    trials: Trials, monkeypatch: pytest.MonkeyPatch, slower: bool
+) -> None:
+    warned = list[str]()
+    monkeypatch.setattr(tokens, "timed", lambda entrants, threads: [Times((6.2,)), Times((7.3 if slower else 5.0,))])
+    monkeypatch.setattr(trials.bar, "warn", warned.append)
+    assert tried(trials).plan.tokens is not None
+    told = "a call takes 7.3 ms here if tokens are reused, and 6.2 if all are computed: these encoders are too small"
+    assert [one.startswith(told) for one in warned] == [True] * slower
+
+
 def test_where_time_runs_out_the_settings_that_were_tried_count(
     trials: Trials, monkeypatch: pytest.MonkeyPatch
 ) -> None:

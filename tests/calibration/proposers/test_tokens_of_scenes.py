@@ -17,6 +17,7 @@ from ttscompile.calibration.trials import Trials
 from ttscompile.core.plan import Plan, TokenReuse
 from ttscompile.errors import CalibrationFailedError
 from ttscompile.ir.pieces import SCENE
+from ttscompile.measure.timer import Times
 
 pytestmark = pytest.mark.slow
 
@@ -45,6 +46,7 @@ def tried(trials: Trials, monkeypatch: pytest.MonkeyPatch, limits: Mapping[Token
 
     monkeypatch.setattr(tokens, "judge", scored)
     monkeypatch.setattr(tokens, "further", lambda one, _: (one.distance / 2, one.distance))
+    monkeypatch.setattr(tokens, "timed", lambda entrants, threads: [Times((2.0,)), Times((1.0,))])
     (found,) = proposed(Tokens(request()), trials, trials.base)
     return found
 

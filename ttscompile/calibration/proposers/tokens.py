@@ -87,6 +87,8 @@ class Tokens(Proposer):
         of = "new frames" + " and scenes" * (setting.scene is not None)
         self.told = f"on the calls that it was chosen on, {score.tokens:.0%} of the tokens of {of} are computed"
         notes, made = {**asdict(setting), "computed": score.tokens}, replace(plan, tokens=setting)
+        if not self.request.by_time:
+            self._warn_if_slower(trials, all_tokens, made)
         shared = {"tokens": setting}
         yield Proposal(trials.changed_name, made, notes, margin=self.margin, shared=shared, refusal=_too_many)
 
@@ -95,10 +97,20 @@ class Tokens(Proposer):
 
         Then nothing is judged: of many settings that takes longer than all else that a build does.
         """
-        whole, few = (one.median for one in timed([(trials, all_tokens), (trials, fewest)], self.request.threads))
+        whole, few = self._milliseconds(trials, all_tokens, fewest)
         if (ALIKE if self.request.deadline_ms is None else 1) * few >= whole:
             told = f"a call takes {whole:.3g} ms with all tokens, and {few:.3g} with the fewest"
             raise CalibrationFailedError(f"looking for changes saves too little: {told}")
+
+    def _warn_if_slower(self, trials: Trials, all_tokens: Plan, made: Plan) -> None:
+        """A calibration chooses by no clock, so it says what a build would have left out for its time."""
+        whole, few = self._milliseconds(trials, all_tokens, made)
+        if few >= whole:
+            told = f"a call takes {few:.3g} ms here if tokens are reused, and {whole:.3g} if all are computed"
+            trials.bar.warn(f"{told}: these encoders are too small for it. 'ttscompile build' leaves it out then.")
+
+    def _milliseconds(self, trials: Trials, *plans: Plan) -> list[float]:
+        return [one.median for one in timed([(trials, plan) for plan in plans], self.request.threads)]
 
 
 def _too_many(score: Score, others: Mapping[str, Score]) -> str | None:
