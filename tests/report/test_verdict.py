@@ -26,6 +26,11 @@ def test_without_a_deadline_the_longest_call_is_told() -> None:
     )
 
 
+def test_the_distance_is_that_which_confirms_the_choice() -> None:
+    (told,) = chosen(built(confirmed={"distance": 0.064, "interval": [0.04, 0.0912]}))
+    assert told.startswith("Chosen among 2 plans: 4 of 16 steps: 0.064 of what other noise changes, 0.091 at worst;")
+
+
 def test_with_one_it_is_the_99th_percentile_of_what_is_allowed() -> None:
     (told,) = chosen(built(budget={"latency_ms": 40.0}, calls=200))
     assert "; 7.41 ms a call on the machine that built it, 9.04 at the 99th percentile of 40 allowed. Not" in told
