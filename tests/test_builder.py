@@ -195,6 +195,35 @@ def test_a_build_that_does_not_succeed_changes_nothing_and_can_be_resumed(
     assert not building(target).exists()
 
 
+@pytest.mark.parametrize("resume", [True, False])
+def test_a_build_that_ends_with_the_original_can_be_gone_on_with(
+    resume: bool, asked: dict[str, Any], calibrated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its artifact has nothing of the search, and without ``resume`` the next build begins anew."""
+    recording, found, told = policies.record(calibrated.parent / "calls.npz"), list[str](), dict[str, tuple[str, ...]]()
+
+    def calibrate(made: Path, *_: Any, **__: Any) -> None:
+        found.append((made / STATE).read_text() if (made / STATE).exists() else "none")
+        if len(found) == 1:
+            (made / STATE).write_text("answers")
+        else:
+            (made / STATE).unlink(missing_ok=True)
+
+    monkeypatch.setattr(builder, "calibrate", calibrate)
+    ttscompile.build("policy.ckpt", calibrated, [recording], explain=told.__setitem__)
+    assert load_artifact(calibrated).manifest.default_plan == "dense" and not (calibrated / STATE).exists()
+    assert told["end"][0].startswith("the original is the default. The same command with --resume and more --minutes")
+    ttscompile.build("policy.ckpt", calibrated, [recording], resume=resume)
+    assert found == ["none", "answers" if resume else "none"]
+    assert not building(calibrated).exists() and not (calibrated / STATE).exists()
+
+
+def test_a_build_with_nothing_to_go_on_from_says_so(asked: dict[str, Any], directory: Path) -> None:
+    recording, told = policies.record(directory.parent / "calls.npz"), dict[str, tuple[str, ...]]()
+    ttscompile.build("policy.ckpt", directory, [recording], resume=True, explain=told.__setitem__)
+    assert told["resume"][0].endswith("there is nothing to go on from, so the build begins anew")
+
+
 def test_two_builds_in_one_place_are_one_too_many(
     asked: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

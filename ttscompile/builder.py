@@ -60,7 +60,8 @@ def build(
     image encoders. All are judged on held-out episodes against the original, and timed on this machine. If
     other plans take at most a fifth longer than the fastest, the nearest of them is chosen.
 
-    All is done in a folder beside ``directory``. It stays until the next build where there is a state to go on from.
+    All is done in a folder beside ``directory``. It stays until the next build where there is a state to go on from:
+    after an interruption, an error, or an end with the original as the default.
     ``checkpoint``, ``directory`` and ``explain`` are those of ``convert``; ``observation``, ``progress`` and ``ray``
     those of ``calibrate``.
 
@@ -77,7 +78,7 @@ def build(
         threads: that calls have.
         max_minutes: by the clock, for all but the conversion.
         seed: of everything random.
-        resume: go on where the same build was interrupted.
+        resume: go on where the same build was interrupted, or ended with the original; anew if there is no such state.
         of_checkpoint: ``format``, ``task``, ``encoders``, ``without_cameras`` and ``base`` of ``convert``.
 
     Raises:
@@ -123,7 +124,12 @@ def build(
             progress=progress,
             ray=ray,
         )
+        if (made / STATE).is_file():
+            (made / STATE).replace(_kept(made))
         put(made)
+        if _kept(made).is_file():
+            told = "more --minutes, or with another --error, goes on from what was answered and searched"
+            explain("end", (f"the original is the default. The same command with --resume and {told}.",))
     return result
 
 
@@ -145,7 +151,12 @@ def _beside(target: Path) -> Iterator[Path]:
 
 
 def _worth_keeping(made: Path) -> bool:
-    return (made / STATE).is_file() or bool(learned_plans(made))
+    return (made / STATE).is_file() or _kept(made).is_file() or bool(learned_plans(made))
+
+
+def _kept(made: Path) -> Path:
+    """The state of a build that ended with the original, once the artifact that was ``made`` is in its place."""
+    return made.with_name(STATE)
 
 
 def _convert(
@@ -154,6 +165,11 @@ def _convert(
     """Convert; where an interrupted build has done that, see that it was of this checkpoint, and leave it."""
     if not (resume and (directory / STATE).is_file()):
         convert(checkpoint, directory, explain=explain, **how)
+        if resume and _kept(directory).is_file():  # calibration sees that it is of this model
+            _kept(directory).replace(directory / STATE)
+        elif resume:
+            explain("resume", (f"{directory}: there is nothing to go on from, so the build begins anew",))
+        _kept(directory).unlink(missing_ok=True)
         return
     again = directory.with_name("again")
     convert(checkpoint, again, explain=explain, **how)

@@ -19,6 +19,7 @@ from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.proposer import Proposal, Proposer
 from ttscompile.calibration.proposers import rows_of
+from ttscompile.calibration.state import FILE as STATE
 from ttscompile.calibration.trials import CONFIRMING, HELD_OUT, LEARNED, Trials
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE, Plan
@@ -179,5 +180,12 @@ def test_a_build_that_has_no_time_ends_with_the_original_and_says_what_it_left_o
     )
     assert any("Time was too short, so the original is all that there is." in one for one in warned)
     assert any("Left out or cut short: original, " in one for one in warned)
+    # More time, or a larger error, goes on with the answers that it has.
+    assert (artifact / STATE).is_file()
+    answers = list[str]()
+    monkeypatch.setattr(Bar, "stage", lambda self, what, *_: answers.append(what))
+    further = calibrate(artifact, [recording], **how | {"max_minutes": 0.1, "max_distance": 3.0}, resume=True)
+    assert further.default_plan == "schedule" and not (artifact / STATE).exists()
+    assert not any("original, held out" in one for one in answers)
     with pytest.raises(CalibrationFailedError, match="no plan"):  # which the original need not keep
         calibrate(artifact, [recording], **how, latency_ms=1e3)

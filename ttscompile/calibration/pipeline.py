@@ -15,7 +15,7 @@ from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import update_plans
 from ..core.coercion import integer
-from ..core.plan import ORIGINAL, SCHEDULE
+from ..core.plan import DENSE, ORIGINAL, SCHEDULE
 from ..errors import CalibrationError, CalibrationFailedError
 from ..measure.machine import timed_on
 from ..pool import opened_pool
@@ -295,7 +295,8 @@ def calibrate(
         )
         _warn_of_result(bar, result, max_minutes, clock.left_out)
         _write(directory, artifact, result, kept, anew)
-        state.remove()
+        if not (chooses and result.default_plan == DENSE):  # more time, or a larger error, may go on from there
+            state.remove()
         return result
 
 

@@ -17,7 +17,8 @@ from ..core.untrusted_json import parse_json
 from ..errors import ArtifactError, CalibrationError
 
 FILE = "calibration-state.safetensors"
-"""Never listed in the manifest: an artifact is complete without it, and it is removed when calibration ends."""
+"""Never listed in the manifest: an artifact is complete without it. It is removed when calibration ends, but for one of
+loops that ends with the original."""
 
 MAX_TEXT_BYTES = 16 * 2**20
 

@@ -57,7 +57,7 @@ SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
 )
 @threads_option("Time calls with so many threads: those that the policy will have on the robot.")
 @number_option("--minutes", MINUTES, "Be done in so many minutes, about, once it is compiled.", default=30.0)
-@click.option("--resume", is_flag=True, help="Go on where the same build was interrupted.")
+@click.option("--resume", is_flag=True, help="Go on where the same build was interrupted, or ended with the original.")
 @lerobot_options
 @json_option
 def build(
@@ -88,7 +88,7 @@ def build(
 
         def explain(stage: str, notes: tuple[str, ...]) -> None:
             status.update(f"compiling: after {stage}")
-            if stage in ("recordings", "loop"):
+            if stage in ("recordings", "loop", "resume", "end"):
                 say(console, *notes)
             if stage == "write":
                 status.stop()  # the search has a bar of its own
