@@ -165,6 +165,29 @@ def test_nothing_that_may_cost_success_is_the_default_unasked(
         chosen(monkeypatch, trials, figures, deadline_ms=3.0, **bounds)
 
 
+def test_where_time_was_too_short_for_a_plan_that_is_near_the_original_is_all_there_is(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    """Nothing fails for want of time, unless there is a deadline, which the original need not keep."""
+    trials, figures = trials_of(artifact, [recording]), {"a": (0.01, 9.0, 1.0)}
+    kept = Kept(trials, anew=True)
+    kept.plans["a"] = plan = replace(trials.base)
+    monkeypatch.setattr("ttscompile.calibration.choose.judge", lambda *_: score_of(*figures["a"][:2]))
+    monkeypatch.setattr(
+        "ttscompile.calibration.choose.timed",
+        lambda entrants, *_: [Times((float(plan is not own),)) for _, own in entrants],
+    )
+    asked: dict[str, float]
+    for asked in ({}, {"deadline_ms": 50.0}):
+        with pytest.raises(CalibrationFailedError, match="no plan is near enough .*'a', is 0.01 away, and 9 at worst"):
+            choose(kept, request(bound=0.1, farthest=0.25, **asked))
+        trials.clock.left_out.append("search, original, 2 steps")
+    del trials.clock.left_out[1:]
+    frontier = choose(kept, request(bound=0.1, farthest=0.25))
+    assert (frontier.default, set(frontier.plans), set(frontier.scores)) == (DENSE, {DENSE}, {DENSE})
+    assert {row["name"]: row["near"] for row in frontier.tried} == {"a": False, DENSE: True}
+
+
 def test_what_another_machine_may_choose_is_kept_beside(
     monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
 ) -> None:

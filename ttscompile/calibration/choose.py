@@ -88,16 +88,18 @@ def choose(kept: Kept, request: Request) -> Frontier:
     is kept as spare.
 
     Raises:
-        CalibrationFailedError: no plan is within ``Request.farthest``; or none that is near enough keeps the deadline,
-            nor does ``dense``.
+        CalibrationFailedError: no plan is within ``Request.farthest``, though there was time; or none that is near
+            enough keeps the deadline, nor does ``dense``.
     """
     entrants, bound, farthest = _Entrants(kept, request), request.bound, request.farthest
     scores, within = entrants.scores, entrants.within
-    if not within:  # there was no time for any
-        return Frontier(entrants.rows({}, (), ()), {DENSE: kept.plans[DENSE]}, {}, {DENSE: scores[DENSE]}, DENSE)
+    short = bool(kept.trials.clock.left_out) and request.deadline_ms is None
     chosen, default = entrants.confirmed(bound, entrants.best), SCHEDULE
     if chosen is None:
         if not (allowed := entrants.near(farthest)):
+            if not within or short:  # there was no time for any, or for a nearer one
+                alone = {DENSE: kept.plans[DENSE]}
+                return Frontier(entrants.rows({}, (), ()), alone, {}, {DENSE: scores[DENSE]}, DENSE)
             name = min(within, key=lambda n: scores[n].interval[1])
             raise CalibrationFailedError(too_far(kept.trials, request, name, scores[name]))
         chosen, default = entrants.nearest(allowed, entrants.near(bound)), DENSE

@@ -32,7 +32,7 @@ from .kept import Kept
 from .progress import Bar
 from .proposer import Proposer, Request, Row
 from .proposers import LOOPS, SCHEDULES, rows_of
-from .recordings import warn_of_recordings
+from .recordings import require_two_calls, warn_of_recordings
 from .schedule import FINISHED, TIME_LIMIT, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
@@ -260,6 +260,8 @@ def calibrate(
         with Bar(progress) as bar:
             opened = {"clock": clock, "bar": bar, "pool": pool, "device": torch_device, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
+            if chooses:
+                require_two_calls(trials)
             warn_of_recordings(trials, rows, corrects)
             # Where a distance was allowed, no plan that is kept is too far away to be the default.
             kept = Kept(trials, anew, FARTHEST if max_distance is None else np.inf)

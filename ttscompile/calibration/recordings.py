@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from ..artifact.ceiling import few_steps
+from ..errors import CalibrationError
 from .calls import window_of
 from .judge import other_noise, other_observations
 from .proposer import Row
@@ -31,6 +32,15 @@ def warn_of_recordings(trials: Trials, rows: Sequence[Row], corrects: bool) -> N
         bar.warn(
             f"the recordings give {count} calls to learn from, and a correction needs {fewest}: it may do harm where"
             " nothing was recorded. Record more episodes."
+        )
+
+
+def require_two_calls(trials: Trials) -> None:
+    """Raise CalibrationError where one call is held out: then no distance has limits, and no plan is near enough."""
+    if len(trials.held_out.calls) == 1:
+        raise CalibrationError(
+            "the recordings leave one call to judge plans on, of which nobody can say how far off they may be; expected"
+            " two at least. Record more episodes, or longer ones: sixteen serve well."
         )
 
 

@@ -303,6 +303,15 @@ def test_what_was_timed_with_other_threads_is_not_gone_on_with(directory: Path, 
         calibrate(directory, [recording], threads=2, resume=True, **how)
 
 
+def test_one_call_to_judge_on_is_refused_before_anything_is_searched(directory: Path, tmp_path: Path) -> None:
+    """Of two episodes of one call; no distance would have a limit, however long the search."""
+    recording = tmp_path / "short.npz"
+    np.savez(recording, obs=np.eye(2, 6, dtype=np.float32).reshape(2, 2, 3), episode_ends=[1, 2])
+    told = "leave one call to judge plans on, .* expected two at least. Record more"
+    with pytest.raises(CalibrationError, match=told):
+        calibrate(directory, [recording], learn=("loops",), progress=False)
+
+
 def test_what_loops_cannot_keep_is_refused(directory: Path, recording: Path) -> None:
     with pytest.raises(CalibrationError, match="makes the first plan; found 'schedule' and 'loops'"):
         calibrate(directory, [recording], learn=("schedule", "loops"), progress=False)
