@@ -134,7 +134,10 @@ NAN = np.where(np.arange(30).reshape(5, 2, 3) == 13, np.nan, 0).astype(np.float3
     [
         (changed(obs=None), "has no array 'obs' for the observation 'obs'; it has goal"),
         (changed(obs=None, state=np.zeros((5, 2, 3))), "has no array 'obs'.*; it has goal, state"),
-        (changed(obs=np.zeros((5, 2, 4), np.float32)), r"'obs' has shape \[5, 2, 4\]; expected .*\[.., 2, 3\]"),
+        (
+            changed(obs=np.zeros((5, 2, 4), np.float32)),
+            r"'obs' has shape \[5, 2, 4\]; expected .* 3\]. Give what this policy",
+        ),
         (changed(obs=np.zeros((5, 3), np.float32)), r"shape \[5, 3\].*If its rows are frames, say so"),
         (changed(obs=np.zeros((5, 1, 2, 3), np.float32)), r"without the axis of streams: obs\[:, 0\]"),
         (changed(obs=np.zeros((4, 2, 3), np.float32)), "observations differ in length"),

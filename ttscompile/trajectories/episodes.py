@@ -309,6 +309,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         elif spec.image:
             last = array.shape[1:] == (*shape[:-3], *shape[-2:], shape[-3])
             told += " Its channels are last: use np.moveaxis(image, -1, -3)." if last else " Is it another camera's?"
+        else:
+            told += " Give what this policy observes; --observation KEY=NAME:N takes the first N numbers of an array."
         raise TrajectoryError(told)
     wanted = np.dtype(spec.dtype)
     allowed = "fiu" if wanted.kind == "f" else wanted.kind if wanted.kind not in "iu" else "iu"
