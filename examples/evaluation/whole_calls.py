@@ -11,7 +11,8 @@ makes a clean chunk of each in one evaluation, with the new observation, and beg
 is nearer than a threshold to what the call before planned; with none, or by chance, with noise. ``0.02:8`` is that
 threshold, and how many steps a call has at least, the paper's k_min. Without it the last step alone would be left: a
 sample that is hardly noisy is its own chunk. The paper's buffer has samples of several calls; here it has those of
-the last one. On a GPU the buffer is one evaluation. On a core it is one for each sample, and both are counted.
+the last one. All of them are looked at in one evaluation of many rows, as the paper has it; with ``--apart`` one after
+the other, which finds the same. Steps and rows are counted, and the milliseconds of looking.
 
 **SP-VLA** (arXiv 2506.12723) leaves out the call where the last action was fast, and extrapolates: a ridge regression
 of the last actions on time. The call after it is always made, where the paper has a share of real actions. Its tokens
@@ -32,9 +33,9 @@ from typing import Any
 import click
 import numpy as np
 import numpy.typing as npt
-import torch
 from environments import environment_class, environment_option
 from evaluate import Evaluation, evaluate
+from falcon import Count, Falcon
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -50,122 +51,12 @@ from variants import (
 )
 
 import ttscompile
-from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.view import view_of
 from ttscompile.core.spec import FloatArray
-from ttscompile.errors import TtscompileError
-from ttscompile.runtimes.info import PolicyInfo
-from ttscompile.runtimes.inpainting import noise_levels
-from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
-from ttscompile.runtimes.reference.sampler import TorchSampler
-
-EXPLORED = 0.1
-"""Share of Falcon's calls that begin with noise whatever the threshold says."""
 
 MEMORY, RIDGE = 8, 1e-3
 """SP-VLA's actions to extrapolate from, and the ridge of the regression."""
 
 Array = npt.NDArray[Any]
-
-
-@dataclass
-class Count:
-    """What calls took so far, of all streams.
-
-    Attributes:
-        calls: that there were, left out or not.
-        steps: evaluations that were steps of the loop.
-        checks: evaluations that looked for where to begin.
-    """
-
-    calls: int = 0
-    steps: int = 0
-    checks: int = 0
-
-
-class Falcon:
-    """A policy whose calls begin with samples of the call before, where those are near enough.
-
-    Args:
-        directory: of an artifact.
-        plan: that computes every cell.
-        threshold: mean absolute difference of normalised actions.
-        least: steps of a call.
-        seed: of which calls begin with noise.
-    """
-
-    def __init__(self, directory: Path, plan: str, threshold: float, least: int = 1, seed: int = 0) -> None:
-        artifact = load_artifact(directory)
-        view = view_of(artifact, artifact.plan(plan))
-        self._spec, levels = view.manifest.spec, noise_levels(view.manifest.spec.sampler)
-        if levels is None or self._spec.sampler.memories or self._spec.sampler.stochastic:
-            raise TtscompileError(f"{directory}: its loop is no deterministic one of one step. Use --sampler ddim.")
-        self._model, self._sampler = ReferenceModel.from_view(view), TorchSampler(self._spec.sampler)
-        self._signal, self._deviation = (torch.from_numpy(one.astype(np.float32)) for one in levels)
-        if least > (steps := self._spec.sampler.steps):
-            raise TtscompileError(f"{directory}: its loop has {steps} steps; {least} cannot be left.")
-        self._threshold, self._least, self._seed, self.count = threshold, least, seed, Count()
-        self.info: PolicyInfo = ttscompile.load(directory, plan=plan).info
-        self.reset()
-
-    def reset(self) -> None:
-        """A new episode."""
-        self._samples: list[torch.Tensor] = []
-        self._rng = np.random.default_rng(self._seed)
-
-    def predict_action(
-        self, obs_dict: Mapping[str, Any], noise: ttscompile.Noise | None = None, plan: object = None
-    ) -> Mapping[str, Any]:
-        """One call."""
-        specs, chunk = self._spec.observations, self._spec.chunk
-        obs = {key: torch.from_numpy(spec.normalized(np.asarray(obs_dict[key]))) for key, spec in specs.items()}
-        assert noise is not None
-        with torch.no_grad():
-            contexts, initial = self._model.prologue(obs), torch.from_numpy(noise.initial)
-            begins, begun = self._beginnings(contexts, initial)
-            samples, following, streams = list[torch.Tensor](), initial, len(initial)
-            for k in range(self._model.steps):
-                samples.append(torch.where((begins >= k)[:, None, None], begun[k], following))
-                output = self._output(samples[k], k, contexts)
-                following = self._sampler.advance(self._sampler.begin(samples[k]), output, None, k).sample
-            samples.append(following)
-        self._samples = samples
-        self.count.calls += streams
-        self.count.steps += int((self._model.steps - begins).sum())
-        actions = chunk.unnormalized(samples[-1].numpy(), chunk.reference(dict(obs_dict)))
-        return {"action": actions[:, chunk.start : chunk.stop]}
-
-    def _beginnings(self, contexts: Contexts, initial: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """At which step each stream begins; and the samples to begin with, by step."""
-        steps, chunk = self._model.steps, self._spec.chunk
-        begun, begins = [initial] * steps, torch.zeros(len(initial), dtype=torch.int64)
-        if not self._samples:
-            return begins, begun
-        moved = chunk.stop - chunk.start
-        planned = self._samples[-1]
-        ahead = torch.cat([planned[:, moved:], planned[:, -1:].expand(-1, moved, -1)], 1)
-        free = torch.from_numpy(self._rng.random(len(initial)) >= EXPLORED)
-        for k in range(1, steps - self._least + 1):
-            tail = self._signal[k] * ahead[:, -moved:] + self._deviation[k] * initial[:, -moved:]
-            begun[k] = torch.cat([self._samples[k][:, moved:], tail], 1)
-            clean = self._clean(begun[k], k, contexts)
-            near = (clean - ahead)[:, :-moved].abs().mean((1, 2)) < self._threshold
-            begins = torch.where(near & free, k, begins)
-        self.count.checks += (steps - self._least) * len(initial)
-        return begins, begun
-
-    def _output(self, sample: torch.Tensor, k: int, contexts: Contexts) -> torch.Tensor:
-        def blocks(k: int, stream: torch.Tensor) -> torch.Tensor:
-            for b in range(self._model.blocks):
-                stream = stream + self._model.block(b, k, stream, contexts)
-            return stream
-
-        return self._model.predict(sample, k, contexts, blocks)
-
-    def _clean(self, sample: torch.Tensor, k: int, contexts: Contexts) -> torch.Tensor:
-        table = self._spec.sampler
-        clean = table.sample_to_x0[k] * sample + table.out_to_x0[k] * self._output(sample, k, contexts)
-        return clean if table.clip is None else clean.clamp(-table.clip, table.clip)
 
 
 def extrapolated(actions: FloatArray, count: int) -> FloatArray:
@@ -258,18 +149,21 @@ class Row:
     Attributes:
         steps: evaluations that are steps of the loop.
         checks: those that look for where to begin.
+        looking: milliseconds of these.
     """
 
     label: str
     steps: float
     checks: float
+    looking: float
     evaluation: Evaluation
 
     def cells(self) -> list[str]:
         """For the table."""
         own = self.evaluation
         differences = ["" if one is None else str(one) for one in (own.score_difference, own.success_difference)]
-        return [self.label, f"{self.steps:.1f}", f"{self.checks:.1f}", str(own.score), str(own.success), *differences]
+        counts = [f"{one:.1f}" for one in (self.steps, self.checks, self.looking)]
+        return [self.label, *counts, str(own.score), str(own.success), *differences]
 
 
 def _several(read: Callable[[str], Any], example: str) -> Callable[..., tuple[Any, ...]]:
@@ -303,6 +197,7 @@ def _beginning(word: str) -> tuple[float, int]:
     callback=_several(_beginning, "0.02:8"),
     help="Begin where chunks differ by less; at least N steps.",
 )
+@click.option("--apart", is_flag=True, help="Look at Falcon's beginnings one after the other.")
 @click.option("--light", default="", callback=_several(float, "4,8"), help="Leave out calls after faster actions.")
 @click.option("--look", default="", callback=_several(_count, "2,3"), help="Look at the first of so many calls.")
 @click.option("--displacements", is_flag=True, help="Actions say how far to move.")
@@ -314,6 +209,7 @@ def _beginning(word: str) -> tuple[float, int]:
 def main(
     variants: tuple[str, ...],
     falcon: tuple[tuple[float, int], ...],
+    apart: bool,
     light: tuple[float, ...],
     look: tuple[int, ...],
     displacements: bool,
@@ -333,7 +229,7 @@ def main(
     whole = opened()
     counted: dict[str, Falcon | Light | Kept] = {}
     for threshold, least in falcon:
-        counted[f"Falcon, {threshold:g}:{least}"] = Falcon(directory, plan, threshold, least)
+        counted[f"Falcon, {threshold:g}:{least}"] = Falcon(directory, plan, threshold, least, together=not apart)
     for fast in light:
         counted[f"SP-VLA, {fast:g}"] = Light(opened(), whole.policy.info.K, fast, displacements)
     for every in look:
@@ -351,11 +247,14 @@ def main(
         )
     rows = [_row(variant, own, counted.get(variant.label)) for variant, own in zip(driven, found, strict=True)]
     if as_json:
-        told = [{"steps": row.steps, "checks": row.checks} | row.evaluation.to_json() for row in rows]
+        told = []
+        for row in rows:
+            counts = {"steps": row.steps, "checks": row.checks, "looking_ms": row.looking}
+            told.append(counts | row.evaluation.to_json())
         click.echo(json.dumps(told))
         return
     table = Table(title=f"{environment}: {episodes} paired episodes; evaluations of the network in a call")
-    for column in ("", "steps", "checks", "score", "success", "score, difference", "success, difference"):
+    for column in ("", "steps", "checks", "ms of them", "score", "success", "score, difference", "success, difference"):
         table.add_column(column, justify="right" if column else "left")
     for row in rows:
         table.add_row(*row.cells())
@@ -364,8 +263,9 @@ def main(
 
 def _row(variant: Variant, own: Evaluation, rule: Falcon | Light | Kept | None) -> Row:
     if rule is None:
-        return Row(variant.label, variant.policy.info.K * (1 - (own.sparsity or 0)), 0, own)
-    return Row(variant.label, rule.count.steps / rule.count.calls, rule.count.checks / rule.count.calls, own)
+        return Row(variant.label, variant.policy.info.K * (1 - (own.sparsity or 0)), 0, 0, own)
+    done = rule.count
+    return Row(variant.label, done.steps / done.calls, done.checks / done.calls, 1e3 * done.looking / done.calls, own)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,20 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import falcon as falcons
 import numpy as np
 import pytest
+import torch
 import whole_calls
 from click.testing import CliRunner
 from variants import Variant, seeded_noise
 
 import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
+from ttscompile.core.plan import DENSE
+from ttscompile.runtimes.random_calls import normalized, random_calls
+from ttscompile.runtimes.reference.model import ReferenceModel
 
 CALLS, STREAMS = 4, 3
 
@@ -43,13 +50,46 @@ def test_without_a_threshold_falcon_is_the_original(four_steps: Path, whole: Var
     assert light.count == whole_calls.Count(CALLS * STREAMS, 4 * CALLS * STREAMS)
 
 
+def test_looking_at_once_or_one_after_the_other_begins_at_the_same_steps(four_steps: Path, whole: Variant) -> None:
+    one, many = (whole_calls.Falcon(four_steps, "full", 0.3, together=together) for together in (False, True))
+    for mine, other in zip(answers(one, whole), answers(many, whole), strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-2)
+    assert (one.count.steps, one.count.checks) == (many.count.steps, many.count.checks)
+    assert 4 * STREAMS < one.count.steps < 4 * CALLS * STREAMS  # some begin late
+    assert min(one.count.looking, many.count.looking) > 0
+
+
 def test_a_chunk_that_is_near_enough_is_begun_with(
     four_steps: Path, whole: Variant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(whole_calls, "EXPLORED", 0.0)
+    monkeypatch.setattr(falcons, "EXPLORED", 0.0)
     falcon = whole_calls.Falcon(four_steps, "full", np.inf)
     answers(falcon, whole)
     assert falcon.count.steps == (4 + CALLS - 1) * STREAMS  # the last step alone, but for the first call
+
+
+@pytest.mark.parametrize("made", ["four_steps", "toy_compiled"])  # the second has what a step makes of both
+def test_several_steps_are_evaluated_at_once_as_one_after_the_other(made: str, request: pytest.FixtureRequest) -> None:
+    artifact = load_artifact(request.getfixturevalue(made))
+    view = view_of(artifact, artifact.plan(DENSE))
+    spec, model = view.manifest.spec, ReferenceModel.from_view(view)
+    assert (view.pieces.step is not None) == (made == "toy_compiled")
+    calls = [normalized(spec, obs) for obs, _ in random_calls(spec, STREAMS, 0)]
+    obs = {key: torch.from_numpy(np.concatenate([call[key] for call in calls])) for key in calls[0]}
+    steps, draw = [1, 3, 2, 3], torch.Generator().manual_seed(0)
+    samples = [torch.randn(STREAMS, *spec.sample, generator=draw) for _ in steps]
+    with torch.no_grad():
+        contexts = model.prologue(obs)
+        found = falcons.ManySteps(view).outputs(samples, steps, contexts)
+
+        def blocks(k: int, hidden: torch.Tensor) -> torch.Tensor:
+            for b in range(model.blocks):
+                hidden = hidden + model.block(b, k, hidden, contexts)
+            return hidden
+
+        for sample, k, mine in zip(samples, steps, found, strict=True):
+            torch.testing.assert_close(mine, model.predict(sample, k, contexts, blocks), rtol=1e-4, atol=1e-5)
+        assert (found[1] - found[3]).abs().max() > 1e-3  # of the same step, and other samples
 
 
 def test_every_other_call_is_left_out_where_all_are_fast(whole: Variant) -> None:
@@ -95,6 +135,7 @@ def test_they_drive_beside_plans(four_steps: Path) -> None:
     assert result.exit_code == 0, result.output
     rows = {row["label"].removeprefix(f"{four_steps}:"): row for row in json.loads(result.stdout)}
     assert list(rows) == ["full", "Falcon, 0:1", "Falcon, 9:2", "SP-VLA, 1"]
+    assert rows["Falcon, 0:1"]["looking_ms"] > rows["full"]["looking_ms"] == 0
     assert rows["Falcon, 0:1"]["steps"] == rows["full"]["steps"] == 4
     assert 2 <= rows["Falcon, 9:2"]["steps"] < 3
     assert rows["SP-VLA, 1"]["steps"] < 4
