@@ -311,9 +311,9 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
         return (f"Plan {name!r} is {distance:.2f} from the original.",)  # what noise changes is no unit here
     where, driven, lost, most = "above a quarter", 37, 20, 68.0
     if distance <= BOUND:
-        where, driven, lost, most = "within a tenth", 40, 1, 9.0
+        where, driven, lost, most = "within a tenth", 42, 1, 9.0
     elif distance <= FARTHEST:
-        where, driven, lost, most = "within a quarter", 36, 8, 16.5
+        where, driven, lost, most = "within a quarter", 38, 9, 16.5
     told = f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes"
     more = f"Of {driven} such plans that were driven {lost} lost more than 5 points of success, {most} at most"
     return (f"{told}. {more} (docs/evidence/results.md, 'What a distance means').",)
