@@ -210,11 +210,10 @@ class Beside:
         one = {key: value[:1] for key, value in self._obs.items()}
         for number in range(1 + self._rounds):
             for name, (policy, _) in given.items():
-                theirs = _took(partial(answered, policy, one, number))
-                ours = _took(partial(opened[name].predict_action, one))
+                took = _took(partial(answered, policy, one, number)), _took(partial(opened[name].predict_action, one))
                 if number:  # the first does not count
-                    times[name][0].append(theirs)
-                    times[name][1].append(ours)
+                    for kept, ms in zip(times[name], took, strict=True):
+                        kept.append(ms)
         found = []
         for name, (policy, plan) in given.items():
             theirs = answered(policy, self._obs, SEED)

@@ -15,6 +15,7 @@ from falcon import ManySteps
 
 from tests.calibration.tasks import make_task
 from ttscompile.calibration.task import Task
+from ttscompile.errors import CalibrationError
 
 
 @pytest.fixture(scope="module")
@@ -93,5 +94,5 @@ def test_it_tells_of_each_drafter(compiled: Path, recording: Path, four_steps: P
     assert all(row["rounds"] <= 10 <= row["rows"] and 0 <= row["taken"] <= 1 for row in others)
     assert CliRunner().invoke(drafted.main, [str(compiled), *words]).exit_code == 0
     assert CliRunner().invoke(drafted.main, [str(compiled), "-t", str(recording), "--drafts", "1"]).exit_code == 2
-    with pytest.raises(drafted.CalibrationError, match="--sampler ddpm"):
+    with pytest.raises(CalibrationError, match="--sampler ddpm"):
         CliRunner().invoke(drafted.main, [str(four_steps), *words], catch_exceptions=False)

@@ -27,7 +27,7 @@ from ttscompile.runtimes.reference.model import ReferenceModel
 CALLS, STREAMS = 4, 3
 
 
-def answers(policy: whole_calls.Falcon | whole_calls.Light, variant: Variant) -> list[whole_calls.Array]:
+def answers(policy: falcons.Falcon | whole_calls.Light, variant: Variant) -> list[whole_calls.Array]:
     """Calls of an episode whose observations move a little."""
     policy.reset()
     (key, spec), given = next(iter(variant.policy.info.observation.items())), np.random.default_rng(0)
@@ -42,16 +42,16 @@ def test_what_is_on_a_line_stays_on_it() -> None:
 
 
 def test_without_a_threshold_falcon_is_the_original(four_steps: Path, whole: Variant) -> None:
-    falcon = whole_calls.Falcon(four_steps, "full", 0.0)
+    falcon = falcons.Falcon(four_steps, "full", 0.0)
     light = whole_calls.Light(whole, 4, np.inf, displacements=False)  # nothing is that fast
     for mine, own in zip(answers(falcon, whole), answers(light, whole), strict=True):
         np.testing.assert_allclose(mine, own, rtol=1e-4, atol=1e-2)  # of 0..512
     assert (falcon.count.steps, falcon.count.checks) == (4 * CALLS * STREAMS, 3 * (CALLS - 1) * STREAMS)
-    assert light.count == whole_calls.Count(CALLS * STREAMS, 4 * CALLS * STREAMS)
+    assert light.count == falcons.Count(CALLS * STREAMS, 4 * CALLS * STREAMS)
 
 
 def test_looking_at_once_or_one_after_the_other_begins_at_the_same_steps(four_steps: Path, whole: Variant) -> None:
-    one, many = (whole_calls.Falcon(four_steps, "full", 0.3, together=together) for together in (False, True))
+    one, many = (falcons.Falcon(four_steps, "full", 0.3, together=together) for together in (False, True))
     for mine, other in zip(answers(one, whole), answers(many, whole), strict=True):
         np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-2)
     assert (one.count.steps, one.count.checks) == (many.count.steps, many.count.checks)
@@ -63,7 +63,7 @@ def test_a_chunk_that_is_near_enough_is_begun_with(
     four_steps: Path, whole: Variant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(falcons, "EXPLORED", 0.0)
-    falcon = whole_calls.Falcon(four_steps, "full", np.inf)
+    falcon = falcons.Falcon(four_steps, "full", np.inf)
     answers(falcon, whole)
     assert falcon.count.steps == (4 + CALLS - 1) * STREAMS  # the last step alone, but for the first call
 
@@ -95,7 +95,7 @@ def test_several_steps_are_evaluated_at_once_as_one_after_the_other(made: str, r
 def test_every_other_call_is_left_out_where_all_are_fast(whole: Variant) -> None:
     light = whole_calls.Light(whole, 4, -1.0, displacements=False)
     made = answers(light, whole)
-    assert light.count == whole_calls.Count(CALLS * STREAMS, 2 * 4 * STREAMS)
+    assert light.count == falcons.Count(CALLS * STREAMS, 2 * 4 * STREAMS)
     expected = whole_calls.extrapolated(made[0][1][-whole_calls.MEMORY :], made[0].shape[1])
     np.testing.assert_array_equal(made[1][1], expected)
 
@@ -125,7 +125,7 @@ def test_pictures_are_kept_between_two_looks_and_the_state_is_new(whole: Variant
         for number in range(3):
             kept.predict_action({"camera": np.array([number]), "state": np.array([number])})
     assert seen.calls == [(0, 0), (0, 1), (2, 2)] * 2
-    assert kept.count == whole_calls.Count(6, 24)
+    assert kept.count == falcons.Count(6, 24)
 
 
 @pytest.mark.slow
@@ -144,7 +144,7 @@ def test_they_drive_beside_plans(four_steps: Path) -> None:
 
 def test_a_loop_that_draws_noise_is_refused(compiled_layer: Path) -> None:
     with pytest.raises(ttscompile.errors.TtscompileError, match="--sampler ddim"):
-        whole_calls.Falcon(compiled_layer, "dense", 0.1)
+        falcons.Falcon(compiled_layer, "dense", 0.1)
 
 
 @pytest.mark.parametrize("words", [["--falcon", "0.1:0"], ["--falcon", "x"], ["--look", "0"], ["--look", "0.5"]])
@@ -154,4 +154,4 @@ def test_rules_that_mean_nothing_are_refused(words: list[str]) -> None:
 
 def test_more_steps_than_the_loop_has_cannot_be_left(four_steps: Path) -> None:
     with pytest.raises(ttscompile.errors.TtscompileError, match="has 4 steps; 5 cannot"):
-        whole_calls.Falcon(four_steps, "full", 0.1, 5)
+        falcons.Falcon(four_steps, "full", 0.1, 5)

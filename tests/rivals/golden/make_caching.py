@@ -44,7 +44,7 @@ def require(clone: Path, name: str) -> None:
         raise SystemExit(f"{clone}: expected {name} at {COMMITS[name]}; found {found.stdout.strip()}.")
 
 
-def made(original: Path, has: Path, evo: Path) -> dict[str, np.ndarray]:
+def made(original: Path, has: Path, evo: Path) -> dict[str, Any]:
     """All arrays: of one call, of BAC's schedules and actions, and of EVO's actions with cells of chance."""
 
     def fresh() -> Any:
@@ -54,7 +54,7 @@ def made(original: Path, has: Path, evo: Path) -> dict[str, np.ndarray]:
     obs = {"obs": draw.uniform(100, 400, (1, 2, 20)).astype(np.float32)}
     noise = noise_of(policy, 1, SEED)
     assert noise.steps is not None
-    found = {
+    found: dict[str, Any] = {
         "obs": obs["obs"],
         "initial": noise.initial,
         "noise": noise.steps,
