@@ -1,7 +1,7 @@
 """BAC and EVO by their authors' own code, on Diffusion Policy's own network, beside the same cells compiled.
 
     python examples/benchmark/caching_beside.py DIR CHECKPOINT DIFFUSION_POLICY -t calls.npz -o theirs \
-      --bac HAS --updates 4,10 --evo EVO --plans evo-0.95
+      --bac HAS --updates 3,10 --evo EVO --plans evo-0.95 --ours bac-0.95
 
 CHECKPOINT is of Diffusion Policy's transformer, DIR what was compiled from it, and DIFFUSION_POLICY, HAS and EVO are
 clones of github.com/real-stanford/diffusion_policy, ky-ji/HAS (whose ``BACInfer`` is BAC) and pillom/EVO. Diffusion
@@ -44,6 +44,7 @@ from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import IllegalPlanError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.policy import CompiledPolicy
 
 SEED = 11
 """Of the noise of the call that BAC looks at, and of those that are compared; its code has this one."""
@@ -174,16 +175,16 @@ class Row:
     Attributes:
         cells: that a call computes.
         error: mean absolute difference of the executed actions from the original's, in their units.
-        apart: largest difference of any action from what the same cells give once compiled.
-        theirs_ms: a call of the authors' code, median.
+        apart: largest difference of any action from what the same cells give once compiled; None without their code.
+        theirs_ms: a call of the authors' code, median; None without it.
         ours_ms: a call of the compiled policy with these cells, median.
     """
 
     name: str
     cells: int
     error: float
-    apart: float
-    theirs_ms: float
+    apart: float | None
+    theirs_ms: float | None
     ours_ms: float
 
 
@@ -202,36 +203,37 @@ class Beside:
         self._original, self._dense = original, answered(original, obs, SEED)
 
     def rows(self, policies: Mapping[str, tuple[Any, Plan]]) -> list[Row]:
-        """Of each policy and the plan that is as it is, after the original itself."""
-        base = self._artifact.plan(DENSE)
-        given = {"the original": (self._original, base), **policies}
+        """Of each policy, or None, and the plan that is as it is, after the original itself."""
+        given = {"the original": (self._original, self._artifact.plan(DENSE)), **policies}
         opened = {name: open_policy(self._artifact, plan=plan, threads=1) for name, (_, plan) in given.items()}
         times: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in given}
         one = {key: value[:1] for key, value in self._obs.items()}
         for number in range(1 + self._rounds):
             for name, (policy, _) in given.items():
-                took = _took(partial(answered, policy, one, number)), _took(partial(opened[name].predict_action, one))
-                if number:  # the first does not count
-                    for kept, ms in zip(times[name], took, strict=True):
-                        kept.append(ms)
-        found = []
-        for name, (policy, plan) in given.items():
-            theirs = answered(policy, self._obs, SEED)
-            opened[name].reset()
-            ours = np.asarray(opened[name].predict_action(dict(self._obs), noise=self._noise)["action_pred"])
-            chunk = self._artifact.manifest.spec.chunk
-            executed = (theirs - self._dense)[:, chunk.start : chunk.stop]
-            cells = dense_plan(*_shape(self._artifact)) if plan.cells is None else plan.cells
-            found.append(
-                Row(
-                    name,
-                    int((cells == Source.COMPUTE).sum()),
-                    float(np.abs(executed).mean()),
-                    float(np.abs(theirs - ours).max()),
-                    *(float(np.median(taken)) for taken in times[name]),
-                )
-            )
-        return found
+                took = [_took(partial(opened[name].predict_action, one))]
+                took += [] if policy is None else [_took(partial(answered, policy, one, number))]
+                for kept, ms in zip(times[name], took, strict=False):
+                    kept += [ms][: bool(number)]  # the first does not count
+        return [self._row(name, opened[name], *given[name], times[name]) for name in given]
+
+    def _row(
+        self, name: str, compiled: CompiledPolicy, policy: Any, plan: Plan, times: tuple[list[float], list[float]]
+    ) -> Row:
+        """Of one, from the same noise."""
+        compiled.reset()
+        ours = np.asarray(compiled.predict_action(dict(self._obs), noise=self._noise)["action_pred"])
+        theirs = None if policy is None else answered(policy, self._obs, SEED)
+        chunk = self._artifact.manifest.spec.chunk
+        wrong = (ours if theirs is None else theirs) - self._dense
+        cells = dense_plan(*_shape(self._artifact)) if plan.cells is None else plan.cells
+        return Row(
+            name,
+            int((cells == Source.COMPUTE).sum()),
+            float(np.abs(wrong[:, chunk.start : chunk.stop]).mean()),
+            None if theirs is None else float(np.abs(theirs - ours).max()),
+            None if theirs is None else float(np.median(times[1])),
+            float(np.median(times[0])),
+        )
 
 
 def _took(call: Callable[[], Any]) -> float:
@@ -258,8 +260,9 @@ def _clone(name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
 @click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), help="A copy of DIR.")
 @_clone("bac")
 @_clone("evo")
-@click.option("--updates", default="4,10", show_default=True, callback=numbers, help="Of each block, for BAC.")
+@click.option("--updates", default="3,10", show_default=True, callback=numbers, help="Of each block, for BAC.")
 @click.option("--plans", default="", help="Plans of DIR that EVO's code executes, with commas between them.")
+@click.option("--ours", default="", help="Plans of DIR that are told of beside, with commas between them.")
 @count_option("--calls", "Answer so many recorded observations, at most.", default=64)
 @count_option("--rounds", "Time so many calls.", default=10)
 @json_option
@@ -273,6 +276,7 @@ def main(
     evo: Path | None,
     updates: Sequence[int],
     plans: str,
+    ours: str,
     calls: int,
     rounds: int,
     as_json: bool,
@@ -301,6 +305,7 @@ def main(
     for name, cells in executed.items():
         assert evo is not None
         beside[f"{name} in EVO's code"] = evo_policy(evo, fresh, cells, work), replace(base, cells=cells)
+    beside |= {name: (None, artifact.plan(name)) for name in filter(None, ours.split(","))}
     obs = {key: value[chosen].astype(np.float32) for key, value in recorded.items()}
     rows = Beside(artifact, whole, obs, rounds).rows(beside)
     shutil.rmtree(work)
@@ -317,8 +322,8 @@ def main(
             row.name,
             str(row.cells),
             f"{row.error:.3g}",
-            f"{row.apart:.1g}",
-            f"{row.theirs_ms:.1f}",
+            "" if row.apart is None else f"{row.apart:.1g}",
+            "" if row.theirs_ms is None else f"{row.theirs_ms:.1f}",
             f"{row.ours_ms:.1f}",
         )
     results_console().print(told)

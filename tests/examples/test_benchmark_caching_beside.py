@@ -80,18 +80,22 @@ def test_both_answer_with_the_same_noise_and_all_is_told(
     np.savez(calls, obs=np.random.default_rng(0).uniform(100, 400, (5, 2, 20)))
     checkpoint.touch()
     words = [str(artifact), str(checkpoint), str(tmp_path), "-t", str(calls), "-o", str(output), "--bac", str(tmp_path)]
-    words += ["--evo", str(tmp_path), "--plans", "some", "--updates", "7", "--calls", "3", "--rounds", "1"]
+    words += ["--evo", str(tmp_path), "--plans", "some", "--ours", "some", "--updates", "7", "--calls", "3"]
+    words += ["--rounds", "1"]
     told = CliRunner().invoke(caching_beside.main, [*words, "--json"], catch_exceptions=False)
     assert told.exit_code == 0, told.output
     document = json.loads(told.stdout)
     assert document["calls"] == 3
-    dense, theirs, other = document["rows"]
-    assert [row["name"] for row in document["rows"]] == ["the original", "bac-theirs-7", "some in EVO's code"]
-    assert [row["cells"] for row in document["rows"]] == [300, 34, 34]
+    dense, theirs, other, ours = document["rows"]
+    names = ["the original", "bac-theirs-7", "some in EVO's code", "some"]
+    assert [row["name"] for row in document["rows"]] == names
+    assert [row["cells"] for row in document["rows"]] == [300, 34, 34, 31]
+    assert (ours["apart"], ours["theirs_ms"]) == (None, None)
+    assert ours["error"] > 1
     assert (dense["error"], dense["apart"]) == (0, 0)
     assert theirs["error"] > 1 > 1e-3 > theirs["apart"]
     assert other["apart"] > 1
-    assert min(row[ms] for row in document["rows"] for ms in ("theirs_ms", "ours_ms")) > 0
+    assert min(row[ms] for row in document["rows"][:3] for ms in ("theirs_ms", "ours_ms")) > 0
     assert asked == [(tmp_path, (1, 2, 20), (7,), True)]
     np.testing.assert_array_equal(load_artifact(output).plan("bac-theirs-7").cells, last)
     assert not (tmp_path / "theirs-work").exists()
