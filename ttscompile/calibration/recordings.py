@@ -37,7 +37,7 @@ def warn_of_recordings(trials: Trials, rows: Sequence[Row], corrects: bool) -> N
 
 def require_two_calls(trials: Trials) -> None:
     """Raise CalibrationError where one call is held out: then no distance has limits, and no plan is near enough."""
-    if len(trials.held_out.calls) == 1:
+    if sum(trials.episodes[number].calls for number in trials.split.validation) == 1:
         raise CalibrationError(
             "the recordings leave one call to judge plans on, of which nobody can say how far off they may be; expected"
             " two at least. Record more episodes, or longer ones: sixteen serve well."
