@@ -240,10 +240,15 @@ def test_an_instruction_that_is_placed_otherwise(tmp_path: Path) -> None:
     directory = save_policy(tmp_path)
     path = directory / "policy_preprocessor.json"
     content = json.loads(path.read_text(encoding="utf-8"))
-    content["steps"].insert(2, {"registry_name": "tokenizer_processor", "config": {"padding_side": "left"}})
+    step: dict[str, Any] = {"registry_name": "tokenizer_processor", "config": {"truncation": False}}
+    content["steps"].insert(2, step)
     write_json(path, content)
     assert load_checkpoint_policy(directory)[1].instruction is None
-    assert_not_read(directory, "expected padding_side right", options=LoadOptions(task="push"))
+    assert_not_read(directory, "does not cut the instruction; expected truncation", options=LoadOptions(task="push"))
+    # CLIP's padding is its end token: before a text it would be read in place of the text's own.
+    step["config"] = {"padding_side": "left"}
+    write_json(path, content)
+    assert_not_read(directory, "the tokenizer's padding_side is 'left'; expected right. CLIP pads with its end token")
 
 
 def test_the_action_is_normalised_whatever_the_features_say(tmp_path: Path) -> None:

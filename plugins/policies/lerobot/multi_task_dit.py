@@ -124,6 +124,12 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
             f"{directory}: the tokenizer's max_length is {length!r:.80}, and tokenizer_max_length of {CONFIG} is"
             f" {config.tokens}; expected the same number."
         )
+    if (side := processors.tokenizer.get("padding_side", "right")) != "right":
+        raise CheckpointError(
+            f"{directory}/{PREPROCESSOR}: the tokenizer's padding_side is {side!r:.80}; expected right. CLIP pads with"
+            " its end token, and the network reads the first of these: what lerobot reads there has seen no word, and"
+            " is another number in other versions. Train with tokenizer_padding_side right."
+        )
     compiled_in = None if options.task is None else _tokens(options.task, config, processors, folders, text)
     weights = _read_weights(config, options)
     try:
@@ -186,17 +192,17 @@ def _tokens(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Tokens and mask ``[1, n]`` of an instruction, without lerobot's padding: no token before it reads that."""
     if not _in_words(processors):
-        found = f"{PREPROCESSOR}: the tokenizer pads before the instruction, or does not cut it"
-        raise CheckpointError(f"{found}; expected padding_side right, truncation true. {NO_TASK}")
+        raise CheckpointError(
+            f"{PREPROCESSOR}: the tokenizer does not cut the instruction; expected truncation true. {NO_TASK}"
+        )
     name = str(processors.tokenizer.get("tokenizer_name") or config.text_encoder_name)
     tokens = torch.tensor([task_tokens(task, name, find_encoder(name, folders), config.tokens, text.vocab_size)])
     return tokens, torch.ones_like(tokens, dtype=torch.bool)
 
 
 def _in_words(processors: Processors) -> bool:
-    """Whether the instruction's tokens begin at the first place and are cut at the last, as text becomes them here."""
-    told = processors.tokenizer
-    return told.get("padding_side", "right") == "right" and told.get("truncation", True) is True
+    """Whether the instruction's tokens are cut at the last place, as text becomes them here."""
+    return processors.tokenizer.get("truncation", True) is True
 
 
 def _read_weights(config: MultiTaskDiTConfig, options: LoadOptions) -> dict[str, torch.Tensor]:
