@@ -210,6 +210,23 @@ def test_a_state_that_cannot_be_removed_is_an_error(
         calibrate(artifact, [recording], 0.7, progress=False)
 
 
+def test_a_full_disk_leaves_the_state_that_was_saved_and_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = StateFile(tmp_path, {})
+    state.save(calls=3)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("ttscompile.artifact.files.write_synced", full)
+    with pytest.raises(CalibrationError, match="No space left.* as it was: make room, and go on .* with --resume"):
+        state.save(calls=4)
+    again = StateFile(tmp_path, {})
+    assert again.load() and again.progress == {"calls": 3}
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+
+
 def test_an_artifact_that_cannot_be_written_is_refused_before_any_work(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

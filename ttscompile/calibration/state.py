@@ -88,7 +88,10 @@ class StateFile:
         try:
             replace_file(self._path, tensors.serialize(arrays))
         except OSError as error:
-            raise CalibrationError(f"{self._path}: the state of the {self.WORK} cannot be written: {error}.") from error
+            raise CalibrationError(
+                f"{self._path}: the state of the {self.WORK} cannot be written: {error}. What was saved before is as it"
+                " was: make room, and go on from there with --resume."
+            ) from error
 
     def remove(self) -> None:
         """Forget everything. Raises CalibrationError: the directory cannot be written."""
