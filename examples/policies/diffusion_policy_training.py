@@ -81,6 +81,7 @@ def recipe_options(steps: int, save_every: int) -> Callable[[Callable[..., None]
         click.option("--save-every", default=save_every, show_default=True, type=click.IntRange(1), help="Steps."),
         click.option("--seed", default=0, show_default=True),
         click.option("--resume", is_flag=True, help="Go on from the last checkpoint in the folder."),
+        click.option("--threads", default=1, show_default=True, type=click.IntRange(1), help="Of a CPU."),
     )
     return lambda command: reduce(lambda made, option: option(made), reversed(options), command)
 
@@ -253,8 +254,10 @@ def train(
     save_every: int,
     seed: int,
     resume: bool,
+    threads: int,
+    start: Path | None = None,
 ) -> None:
-    """Train on one thread or on a GPU, and write checkpoints into a folder.
+    """Train on a CPU or on a GPU, and write checkpoints into a folder.
 
     Args:
         config: The original's configuration, of ``configuration``.
@@ -269,13 +272,16 @@ def train(
         save_every: Steps between checkpoints.
         seed: Of weights, examples and noise.
         resume: Go on from the last checkpoint in the folder.
+        threads: Of a CPU.
+        start: A checkpoint whose average of weights the training begins with, in place of random ones.
     """
+    import dill
     import hydra
     from diffusion_policy.model.common.lr_scheduler import get_scheduler
     from diffusion_policy.model.common.normalizer import LinearNormalizer
     from diffusion_policy.workspace.base_workspace import BaseWorkspace
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     torch.manual_seed(seed)
     device = config.training.device
     workspace = BaseWorkspace(config, output_dir=str(output))
@@ -284,6 +290,11 @@ def train(
     normalizer = LinearNormalizer()
     normalizer.fit({"obs": obs, "action": action}, mode="limits")
     workspace.model.set_normalizer(normalizer)
+    if start is not None:
+        begun = torch.load(start, pickle_module=dill, map_location="cpu", weights_only=False)["state_dicts"][
+            "ema_model"
+        ]
+        workspace.model.load_state_dict({name: value.float() for name, value in begun.items()})
     workspace.model.to(device)
     workspace.ema_model = copy.deepcopy(workspace.model)
     workspace.optimizer = optimizer(workspace.model)

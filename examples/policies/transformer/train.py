@@ -20,7 +20,7 @@ from torch.nn.functional import mse_loss
 
 sys.path[1:1] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "evaluation")]
 
-from diffusion_policy_training import captured, configuration, cut, find_original, recipe_options, train  # noqa: E402
+from diffusion_policy_training import captured, configuration, cut, find_original, in_bfloat16, recipe_options, train  # noqa: E402
 from environments.pusht import observation  # noqa: E402
 
 HORIZON, WINDOW, EXECUTED = 16, 2, 8
@@ -36,9 +36,37 @@ def loss_of(policy: Any, obs: torch.Tensor, action: torch.Tensor) -> torch.Tenso
     return mse_loss(policy.model(noisy, timesteps, scaled["obs"][:, : policy.n_obs_steps]), noise)
 
 
+class DropBytes(torch.nn.Dropout):
+    """Dropout whose mask is of random bytes. A CPU draws torch's in a third of a step, and these in a twentieth.
+
+    The probability is a whole number of 256ths.
+    """
+
+    rng = np.random.Generator(np.random.SFC64(0))
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        """The input, with some of its values replaced by 0 and the others made as much larger."""
+        left_out = round(256 * self.p)
+        drawn = torch.from_numpy(self.rng.integers(256, size=tuple(input.shape), dtype=np.uint8))
+        return input * ((drawn >= left_out).to(input.dtype) * (256 / (256 - left_out)))
+
+
+def on_a_cpu(network: Any) -> Any:
+    """The network's module of the time, once dropout is quick, and attention is two products without a dropout."""
+    torch.backends.cuda.enable_flash_sdp(False)  # of the CPU, too, whose backward takes a third of a step
+    for module in list(network.modules()):
+        if isinstance(module, torch.nn.MultiheadAttention):
+            module.dropout = 0.0
+        for name, child in module.named_children():
+            if isinstance(child, torch.nn.Dropout):
+                setattr(module, name, DropBytes(child.p))
+    return network.time_emb
+
+
 @click.command()
 @recipe_options(steps=60000, save_every=10000)
-@click.option("--device", default="cuda", show_default=True, help="A GPU, as torch calls it.")
+@click.option("--device", default="cuda", show_default=True, help="A GPU, as torch calls it, or cpu.")
+@click.option("--start", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Checkpoint to begin with.")
 @click.option("--learning-rate", default=3e-4, show_default=True, type=click.FloatRange(0, min_open=True))
 @click.option("--dropout", default=0.1, show_default=True, type=click.FloatRange(0, 1), help="Of attention and layers.")
 def main(
@@ -52,8 +80,10 @@ def main(
     **run: Any,
 ) -> None:
     """Train, and write checkpoints into a folder."""
-    if not torch.cuda.is_available():
-        raise click.ClickException("torch finds no GPU here, and this takes weeks without one.")
+    if device != "cpu" and not torch.cuda.is_available():
+        raise click.ClickException(
+            "torch finds no GPU here. Give --device cpu, which takes hours where it has bfloat16."
+        )
     find_original(original)
     changes = {
         "task": {"name": "pusht_lowdim", "obs_dim": 20, "action_dim": 2, "keypoint_dim": 2},
@@ -74,7 +104,7 @@ def main(
         frames,
         "pusht_transformer",
         optimizer=lambda policy: policy.get_optimizer(**config.optimizer),
-        make_step=captured(loss_of),
+        make_step=in_bfloat16(on_a_cpu) if device == "cpu" else captured(loss_of),
         steps=steps,
         seed=seed,
         **run,
