@@ -27,7 +27,6 @@ SMALL = 0.05
 """Share of the artifact's files that a spare plan takes at most: one of Push-T's takes 1.6 %, and one of a network that
 is small beside its corrections may take a tenth."""
 
-
 CHOSEN = 3
 """Plans that get a name, and are confirmed: the default, ``safe`` and ``fast``."""
 
