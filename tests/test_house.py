@@ -181,6 +181,7 @@ def test_circles_and_arrows_up_are_found_and_drawn() -> None:
     assert "circles: artifact - core - ir\narrows up: core -> ir (1 imports); ir" in drawing(doors)
 
 
+@pytest.mark.slow
 def test_the_drawing_can_be_had_as_a_command() -> None:
     result = subprocess.run([sys.executable, ROOT / "tests" / "structure.py"], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
@@ -215,6 +216,7 @@ def test_names_that_are_loaded_are_resolved_as_far_as_the_text_tells(tmp_path: P
     ]
 
 
+@pytest.mark.slow
 def test_the_residual_stream_is_never_the_stream_and_the_glossary_has_each_word_once() -> None:
     """A batch has streams, too: each is called by its own word (design, section 1)."""
     texts = [*MODULES.values(), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]

@@ -86,6 +86,7 @@ def rounded(checkpoint: Path, target: Path) -> Path:
     return target
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("code", "precision"), [("F16", "fp32"), ("BF16", "fp32"), ("BF16", "int8")])
 def test_answers_are_those_of_weights_in_float32(
     one_layer_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, precision: Any

@@ -60,6 +60,7 @@ def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: 
     assert artifact.manifest.default_plan == result.default_plan
 
 
+@pytest.mark.slow
 def test_the_rate_of_training_is_kept_until_another_one_is_said(artifact: Path, tmp_path: Path) -> None:
     silent, said = policies.record(tmp_path / "silent.npz"), policies.record(tmp_path / "said.npz")
     np.savez(said, **np.load(said), meta=np.array('{"policy_hz": 12.5}'))

@@ -67,6 +67,7 @@ def test_everybody_sees_new_pictures_and_is_told_beside_the_first(
         assert off["late"] < 1e-6 < off["dense, int8"]
 
 
+@pytest.mark.slow
 def test_of_a_camera_that_moves_all_is_computed_and_of_a_still_one_what_changed(
     once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

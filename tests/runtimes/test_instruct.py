@@ -165,6 +165,7 @@ def test_a_policy_forgets_its_frames_where_it_is_told_so(once: Once, monkeypatch
         assert scenes.scenes(policy) == expected
 
 
+@pytest.mark.slow
 def test_so_do_all_plans_whichever_is_used(once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, told = once.folder("scenes of rows", scenes.compile_rows), Asked()
     policy = ttscompile.load(folder / "rows", seed=0, plan="dense")

@@ -59,6 +59,7 @@ def test_frames_without_content_have_a_pace(kind: str) -> None:
         assert other("info")["n_obs_steps"] == 2
 
 
+@pytest.mark.slow
 def test_others_are_answered_while_pings_come() -> None:
     """The flood is cut off within its first bytes, over and over: an answer takes as long as without it, but for tens
     of milliseconds where the flood was just read."""

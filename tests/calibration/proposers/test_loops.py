@@ -215,6 +215,7 @@ def test_with_a_deadline_more_steps_are_tried_than_have_to_be(directory: Path, r
     assert max(steps[4.5]) == 1 and max(steps[7.5]) == 4
 
 
+@pytest.mark.slow
 def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording: Path, timed: None) -> None:
     before = load_artifact(directory).manifest.model_identity
     result = calibrate(directory, [recording], learn=("loops",), max_distance=0.4, progress=False, max_minutes=2)
