@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 import torch
+from falcon import output_of
 from variants import full_plan
 
 from ttscompile.artifact.load import load_artifact
@@ -100,7 +101,7 @@ class Check:
         sample = self._signal * going.chunk + self._deviation * going.noise
         with torch.no_grad():
             contexts = self._model.prologue(given)
-            out = self._model.predict(torch.from_numpy(sample), k, contexts, lambda k, h: self._blocks(k, h, contexts))
+            out = output_of(self._model, torch.from_numpy(sample), k, contexts)
         clean = table.sample_to_x0[k] * sample + table.out_to_x0[k] * out.numpy()
         clean = clean if table.clip is None else clean.clip(-table.clip, table.clip)
         start = self._spec.chunk.start
@@ -109,11 +110,6 @@ class Check:
         apart = (np.abs(clean - going.chunk) * counted).sum((1, 2))
         distances = apart / np.maximum(counted.sum((1, 2)) * clean.shape[2], 1)
         return Verdict(distances, clean if self._answered else None)
-
-    def _blocks(self, k: int, hidden: torch.Tensor, contexts: Any) -> torch.Tensor:
-        for b in range(self._model.blocks):
-            hidden = hidden + self._model.block(b, k, hidden, contexts)
-        return hidden
 
 
 class Forecast:

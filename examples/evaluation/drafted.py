@@ -24,7 +24,7 @@ from typing import Any
 import click
 import numpy as np
 import torch
-from falcon import ManySteps
+from falcon import ManySteps, output_of
 from torch import Tensor, nn
 
 from ttscompile.artifact.load import load_artifact
@@ -143,7 +143,7 @@ class Speculating:
     def call(self, contexts: Contexts, initial: Tensor, draft: Draft, ahead: int, done: Done) -> Tensor:
         """The denoised sample ``[1, T, D]``; drafts ``ahead - 1`` steps after the next one, whose sample is known."""
         begun = perf_counter()
-        prediction = self._first(contexts, initial)
+        prediction = output_of(self._model, initial, 0, contexts)
         sample, k = self._noisy(moved_on(self._sampler, initial, prediction, 0), 0), 1
         done.rounds, done.rows = done.rounds + 1, done.rows + 1
         while k < self._steps:
@@ -173,7 +173,7 @@ class Speculating:
         """The same without drafts."""
         begun, sample = perf_counter(), initial
         for k in range(self._steps):
-            mean = moved_on(self._sampler, sample, self._predicted(sample, k, contexts), k)
+            mean = moved_on(self._sampler, sample, output_of(self._model, sample, k, contexts), k)
             sample = self._noisy(mean, k)
         done.rounds, done.rows = done.rounds + self._steps, done.rows + self._steps
         done.seconds += perf_counter() - begun
@@ -182,32 +182,15 @@ class Speculating:
     def _noisy(self, mean: Tensor, k: int) -> Tensor:
         return mean + float(self._table.noise_to_next[k]) * torch.randn(mean.shape, generator=self._draw)
 
-    def _first(self, contexts: Contexts, initial: Tensor) -> Tensor:
-        return self._predicted(initial, 0, contexts)
-
-    def _predicted(self, sample: Tensor, k: int, contexts: Contexts) -> Tensor:
-        def blocks(k: int, hidden: Tensor) -> Tensor:
-            for b in range(self._model.blocks):
-                hidden = hidden + self._model.block(b, k, hidden, contexts)
-            return hidden
-
-        return self._model.predict(sample, k, contexts, blocks)
-
 
 @torch.no_grad()
 def predictions(runner: Runner, calls: Calls) -> tuple[Tensor, Tensor]:
     """Samples and predictions at each step of dense calls, ``[K, N, T, D]`` both."""
     model, sampler, carried = runner.model, runner.model.sampler, runner.model.sampler.begin(calls.initial)
     samples, found = list[Tensor](), list[Tensor]()
-
-    def blocks(k: int, hidden: Tensor) -> Tensor:
-        for b in range(model.blocks):
-            hidden = hidden + model.block(b, k, hidden, calls.contexts)
-        return hidden
-
     for k in range(model.steps):
         samples.append(carried.sample)
-        found.append(model.predict(carried.sample, k, calls.contexts, blocks))
+        found.append(output_of(model, carried.sample, k, calls.contexts))
         carried = Carried(*sampler.advance(carried, found[-1], None if calls.noise is None else calls.noise[k], k))
     return torch.stack(samples), torch.stack(found)
 

@@ -45,6 +45,17 @@ class Count:
     looking: float = 0.0
 
 
+def output_of(model: ReferenceModel, sample: torch.Tensor, k: int, contexts: Contexts) -> torch.Tensor:
+    """What the network gives ``[B, T, D]`` for a sample at step k, with every block computed."""
+
+    def blocks(k: int, hidden: torch.Tensor) -> torch.Tensor:
+        for b in range(model.blocks):
+            hidden = hidden + model.block(b, k, hidden, contexts)
+        return hidden
+
+    return model.predict(sample, k, contexts, blocks)
+
+
 class ManySteps:
     """A network at several steps in one evaluation: each row of the batch is of a stream and a step.
 
@@ -91,15 +102,7 @@ class ManySteps:
             shape = [streams if i == axis else n for i, n in enumerate(rows.shape[1:])]
             given[name] = torch.cat([rows[k].expand(shape) for k in steps], axis)
         whole = Contexts(count * streams, given)
-        return list(self._model.predict(torch.cat(list(samples)), steps[0], whole, self._blocks(whole)).split(streams))
-
-    def _blocks(self, contexts: Contexts) -> Any:
-        def blocks(k: int, hidden: torch.Tensor) -> torch.Tensor:
-            for b in range(self._model.blocks):
-                hidden = hidden + self._model.block(b, k, hidden, contexts)
-            return hidden
-
-        return blocks
+        return list(output_of(self._model, torch.cat(list(samples)), steps[0], whole).split(streams))
 
 
 class Falcon:
@@ -149,7 +152,7 @@ class Falcon:
             samples, following, streams = list[torch.Tensor](), initial, len(initial)
             for k in range(self._model.steps):
                 samples.append(torch.where((begins >= k)[:, None, None], begun[k], following))
-                output = self._output(samples[k], k, contexts)
+                output = output_of(self._model, samples[k], k, contexts)
                 following = self._sampler.advance(self._sampler.begin(samples[k]), output, None, k).sample
             samples.append(following)
         self._samples = samples
@@ -180,21 +183,13 @@ class Falcon:
         self.count.checks += len(looked) * len(initial)
         return begins, begun
 
-    def _output(self, sample: torch.Tensor, k: int, contexts: Contexts) -> torch.Tensor:
-        def blocks(k: int, stream: torch.Tensor) -> torch.Tensor:
-            for b in range(self._model.blocks):
-                stream = stream + self._model.block(b, k, stream, contexts)
-            return stream
-
-        return self._model.predict(sample, k, contexts, blocks)
-
     def _clean(self, samples: Sequence[torch.Tensor], steps: Sequence[int], contexts: Contexts) -> list[torch.Tensor]:
         """The clean chunk that one evaluation makes of each sample at its step."""
         table = self._spec.sampler
         if self._many is not None:
             outputs = self._many.outputs(samples, steps, contexts)
         else:
-            outputs = [self._output(sample, k, contexts) for sample, k in zip(samples, steps, strict=True)]
+            outputs = [output_of(self._model, one, k, contexts) for one, k in zip(samples, steps, strict=True)]
         cleaned = list[torch.Tensor]()
         for sample, k, output in zip(samples, steps, outputs, strict=True):
             clean = table.sample_to_x0[k] * sample + table.out_to_x0[k] * output

@@ -228,6 +228,14 @@ def captured(loss_of: Callable[[Any, torch.Tensor, torch.Tensor], torch.Tensor])
     return make
 
 
+def averaged(checkpoint: Path) -> dict[str, torch.Tensor]:
+    """The moving average of the weights in a checkpoint, in float32."""
+    import dill
+
+    payload = torch.load(checkpoint, pickle_module=dill, map_location="cpu", weights_only=False)
+    return {name: value.float() for name, value in payload["state_dicts"]["ema_model"].items()}
+
+
 def save(workspace: Any, folder: Path, name: str) -> None:
     """Write the checkpoint as the original writes it, and its moving average alone in half precision."""
     import dill
@@ -275,7 +283,6 @@ def train(
         threads: Of a CPU.
         start: A checkpoint whose average of weights the training begins with, in place of random ones.
     """
-    import dill
     import hydra
     from diffusion_policy.model.common.lr_scheduler import get_scheduler
     from diffusion_policy.model.common.normalizer import LinearNormalizer
@@ -291,10 +298,7 @@ def train(
     normalizer.fit({"obs": obs, "action": action}, mode="limits")
     workspace.model.set_normalizer(normalizer)
     if start is not None:
-        begun = torch.load(start, pickle_module=dill, map_location="cpu", weights_only=False)["state_dicts"][
-            "ema_model"
-        ]
-        workspace.model.load_state_dict({name: value.float() for name, value in begun.items()})
+        workspace.model.load_state_dict(averaged(start))
     workspace.model.to(device)
     workspace.ema_model = copy.deepcopy(workspace.model)
     workspace.optimizer = optimizer(workspace.model)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
-from falcon import ManySteps
+from falcon import ManySteps, output_of
 
 from tests.calibration.tasks import make_task
 from ttscompile.calibration.task import Task
@@ -53,7 +53,7 @@ def test_a_perfect_drafter_needs_as_many_evaluations_as_there_are_groups_of_step
     one = runner.select(task.calls, [0])
     loop = drafted.Speculating(runner, ManySteps(runner.view), 0)
     with torch.no_grad():
-        loop.call(one.contexts, one.initial, lambda sample, k, _: loop._predicted(sample, k, one.contexts), ahead, done)
+        loop.call(one.contexts, one.initial, lambda x, k, _: output_of(runner.model, x, k, one.contexts), ahead, done)
     assert done.drafts == done.taken == 8  # neither the first step, which is no draft, nor the last, without noise
     assert (done.rounds, done.rows) == (1 + -(-9 // ahead), 10)
 

@@ -102,7 +102,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
             name = min(within, key=lambda n: scores[n].interval[1])
             raise CalibrationFailedError(too_far(kept.trials, request, name, scores[name]))
         chosen, default = entrants.nearest(allowed, entrants.near(bound)), DENSE
-        entrants.holds(chosen, math.inf)
+        entrants.holds(chosen, math.inf)  # however far away, so that it is told
     named, took = {chosen: SCHEDULE}, entrants.median(chosen)
     distance = entrants.distances[chosen]
 
@@ -281,6 +281,7 @@ class _Entrants:
         )
 
     def _second(self, name: str) -> dict[str, Any]:
+        """``confirmed`` of ``Frontier.tried``, where a plan was."""
         if (one := self._confirmed.get(name)) is None:
             return {}
         return {"confirmed": {"distance": one.distance, "interval": list(one.interval)}}

@@ -305,7 +305,7 @@ def calibrate(
 def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock: Clock, request: Request) -> None:
     """Have each proposer judged, in its share of the time. Raises CalibrationFailedError: nothing was kept."""
     takes = np.cumsum([row.takes for row in rows])
-    if request.by_time:  # what others choose on is answered first: so nobody has to leave time for it
+    if request.by_time:  # what others choose on, and what confirms, is answered first: nobody has to leave time for it
         for part in (LEARNED, CONFIRMING) if len(rows) > 1 else (CONFIRMING,):
             kept.trials.sample(part)
     for number, (row, proposer, share) in enumerate(zip(rows, proposers, takes / takes[-1], strict=True)):

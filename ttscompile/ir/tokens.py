@@ -95,10 +95,8 @@ def find_sequence(scene: Graph) -> TokenStream | str:
         if not real or joined_axis(node) != 1 or not isinstance(tokens, int):
             continue
         entry = node.name
-        stream, behind = (
-            TokenStream(entry, entry, tokens, 0, _axes(scene, entry, tokens)),
-            reachable_from(scene, {entry}),
-        )
+        stream = TokenStream(entry, entry, tokens, 0, _axes(scene, entry, tokens))
+        behind = reachable_from(scene, {entry})
         others = tuple(name for name in scene.outputs if name not in behind)
         cut, own = backward_slice(scene, scene.outputs, {entry: types[entry]}), backward_slice(scene, (entry,), {})
         read = {n: type_ for n, type_ in cut.inputs.items() if n not in {entry, *own.inputs}}

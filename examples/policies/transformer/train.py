@@ -68,7 +68,13 @@ def on_a_cpu(network: Any) -> Any:
 @click.option("--device", default="cuda", show_default=True, help="A GPU, as torch calls it, or cpu.")
 @click.option("--start", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Checkpoint to begin with.")
 @click.option("--learning-rate", default=3e-4, show_default=True, type=click.FloatRange(0, min_open=True))
-@click.option("--dropout", default=0.1, show_default=True, type=click.FloatRange(0, 1), help="Of attention and layers.")
+@click.option(
+    "--dropout",
+    default=0.1,
+    show_default=True,
+    type=click.FloatRange(0, 1),
+    help="Of layers; and of attention, on a GPU.",
+)
 def main(
     original: Path,
     demonstrations: Path,
