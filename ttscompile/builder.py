@@ -58,7 +58,7 @@ def build(
 
     Tried are loops, numbers and places of computed steps with their corrections, eight bits by part, and the tokens of
     image encoders. All are judged on held-out episodes against the original, and timed on this machine. If
-    other plans take at most a fifth longer than the fastest, the nearest of them is chosen.
+    other plans take at most a fifth longer than the fastest and are nearer by more than a fifth, one of them is chosen.
 
     All is done in a folder beside ``directory``. It stays until the next build where there is a state to go on from:
     after an interruption, an error, or an end with the original as the default.

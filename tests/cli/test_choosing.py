@@ -62,6 +62,14 @@ def test_the_fastest_that_is_near_or_the_nearest_of_those_that_are_as_fast() -> 
     assert fastest({"a": 10.0, "b": 12.1, "c": 12.2}, distances) == "a"
 
 
+def test_of_those_that_are_as_near_the_fastest() -> None:
+    """A plan that takes a sixth longer has to be nearer by more than a fifth; one below 0 is no nearer than 0."""
+    times = {"a": 10.0, "b": 11.7}
+    assert fastest(times, {"a": 0.067, "b": 0.057}) == "a"
+    assert fastest(times, {"a": 0.070, "b": 0.057}) == "b"
+    assert fastest(times, {"a": 0.0, "b": -0.02}) == "a"
+
+
 def test_another_machine_has_another_default(built: Path) -> None:
     told, after = again(built, timed(dense=9.0, schedule=4.0, safe=2.0, fast=1.0, uniform=0.1, far=0.2))
     assert told == "The default was 'schedule', and is 'safe'. schedule 4 ms, safe 2 ms, fast 1 ms."

@@ -72,7 +72,7 @@ def build(
 ) -> None:
     """Compile CHECKPOINT, and choose the fastest plan that is near enough to the original.
 
-    If others take at most a fifth longer, the nearest of them is chosen.
+    If others take at most a fifth longer and are nearer by more than a fifth, one of them is chosen.
 
     Denoising loops, computed steps, corrections, eight bits and image tokens are tried; all are judged on recorded
     episodes that nothing was learned from, and timed on this machine. Exit status 1: no plan is near enough, or none of
