@@ -145,13 +145,14 @@ def part_of(piece: str) -> str | None:
     Returns:
         ``blocks`` for blocks and the pieces that hold all of them; the name of a piece of the prologue; and None for
         pieces that are always in fp32: they are small, or no call needs them. A piece for some tokens belongs to the
-        part of the piece for all of them.
+        part of the piece for all of them, and so does what makes a scene's sequence: it may read an embedding.
     """
     if is_block(piece) or piece in OF_ALL_BLOCKS:
         return BLOCKS
+    if piece in (pixels_name(SCENE), tokens_name(SCENE)):
+        return SCENE
     if of_tokens(piece):
-        own = piece.removeprefix(_TOKENS)
-        return (own if own == SCENE else _FRAME + own) if is_tokens(piece) else None
+        return _FRAME + piece.removeprefix(_TOKENS) if is_tokens(piece) else None
     return None if piece.partition(_OF_LOOP)[0] in _SMALL else piece
 
 

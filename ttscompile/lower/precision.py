@@ -24,7 +24,18 @@ from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, columns_at_once, pack
 from ..core.spec import FP32, INT4, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
-from ..ir.pieces import BLOCKS, CONDITION, OF_ALL_BLOCKS, SCENE, STEP, frame_name, is_tokens, part_of, renewed_name
+from ..ir.pieces import (
+    BLOCKS,
+    CONDITION,
+    OF_ALL_BLOCKS,
+    SCENE,
+    STEP,
+    frame_name,
+    is_tokens,
+    of_tokens,
+    part_of,
+    renewed_name,
+)
 from .graph_writer import GraphWriter
 from .integer_attention import HEADS, integer_attention
 from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, NO_ZERO, integer_convolution, shapes_of
@@ -73,7 +84,7 @@ def parts_to_lower(
     rows = {frame_name(i): count for i, count in enumerate(program.pieces.rows)}
     times = {STEP: program.spec.sampler.steps, **rows}
     for piece, graph in program.pieces.graphs().items():
-        if (part := part_of(piece)) is not None and not is_tokens(piece):
+        if (part := part_of(piece)) is not None and not of_tokens(piece):
             flops[part] = flops.get(part, 0) + graph_flops(graph) * times.get(piece, 1)
     if unknown := sorted(set(keep_fp32) - {*flops, PROLOGUE}):
         known = ", ".join(map(repr, (*flops, PROLOGUE)))
@@ -127,7 +138,7 @@ def lower_precision(
                 new.update(own)
         made |= lowered
         constants |= new
-        told = [name for name in pieces if not is_tokens(name)]
+        told = [name for name in pieces if not of_tokens(name)]
         notes += _notes(precision, part, told, {name: lowered[name] for name in told if name in lowered}, new)
     if not made:
         raise LoweringError(
