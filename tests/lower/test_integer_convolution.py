@@ -49,9 +49,14 @@ def quantised(x: Array, weight: Array) -> tuple[torch.Tensor, torch.Tensor]:
         ((9, 8), (3, 2), {"strides": [2, 1], "pads": [0, 1, 2, 1]}),
         ((11, 12), (3, 3), {"dilations": [2, 3], "strides": [1, 2]}),
         ((8, 8), (4, 4), {"strides": [4, 4]}),
+        ((6, 15), (2, 5), {"strides": [2, 5]}),
+        ((9, 8), (4, 4), {"strides": [4, 4]}),
+        ((8, 8), (4, 4), {"strides": [4, 4], "pads": [1, 1, 1, 1]}),
+        ((4, 3), (2, 2), {"strides": [2, 2], "dilations": [2, 1]}),
         ((5, 6), (1, 1), {}),
         ((5, 6), (1, 1), {"strides": [2, 2]}),
         ((40,), (5,), {"pads": [2, 2]}),
+        ((40,), (5,), {"strides": [5]}),
     ],
 )
 @pytest.mark.parametrize("bias", [True, False])
@@ -77,6 +82,15 @@ def test_it_is_exactly_the_quantised_convolution(
     expected += weights.get("b", np.zeros(OUT)).reshape(-1, *[1] * len(sizes))
     assert found.shape == expected.shape
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-4 * np.abs(expected).max())
+
+
+def test_patches_need_no_numbers_of_places() -> None:
+    """Those of SmolVLA's pictures would be a megabyte in each model that has them."""
+    weights = {"w": drawn(OUT, IN, 4, 4)}
+    for strides, numbered in (([4, 4], False), ([2, 4], True)):
+        node = make_node("Conv", ["x", "w"], ["y"], strides=strides)
+        made, _ = quantize_model(model_of([node], ("B", IN, 8, 8), weights), weights)
+        assert ("Gather" in {each.op_type for each in made.graph.node}) is numbered
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def other_placements(steps: int, full_steps: int) -> list[tuple[int, ...]] | Non
     return sorted(set(every) - set(spacings(steps, full_steps)), reverse=True)  # late steps first, see CROWDING
 
 
-COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128)
+COUNTS = (1, 2, 3, 4, 5, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of computed steps that an error budget is tried with, before bisection between two of them."""
 
 FEWER_CROWDINGS = (1.0, 2.0, 3.0, 4.0)

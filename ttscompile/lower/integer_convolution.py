@@ -106,16 +106,21 @@ def integer_convolution(
     padded = [size + before + after for size, before, after in zip(sizes, pads[:axes], pads[axes:], strict=True)]
     spans = zip(padded, kernel, strides, dilations, strict=True)
     result = tuple((size - spread * (taps - 1) - 1) // step + 1 for size, taps, step, spread in spans)
-    seen = _seen(padded, kernel, strides, dilations, result)
     matrix, places = np.moveaxis(weight, (0, 1), (-1, -2)).reshape(-1, out), int(np.prod(result))
     integers, scales = store(node.input[1], matrix)
     pixels, scale, zero = w.ops("DynamicQuantizeLinear", [node.input[0]], 3)
     pixels = w.op("Transpose", pixels, perm=[0, *range(2, 2 + axes), 1])
-    if any(pads):
-        pixels = w.op("Pad", pixels, w.constant([0, *pads[:axes], 0, 0, *pads[axes:], 0]), zero)
-    if not np.array_equal(seen, np.arange(np.prod(padded))):  # else all of them in order
+    patches = not any(pads) and [*strides, *dilations] == [*kernel, *ones]
+    if not patches or sizes != tuple(count * taps for count, taps in zip(result, kernel, strict=True)):
+        if any(pads):
+            pixels = w.op("Pad", pixels, w.constant([0, *pads[:axes], 0, 0, *pads[axes:], 0]), zero)
+        seen = _seen(padded, kernel, strides, dilations, result)
         pixels = w.op("Reshape", pixels, w.constant([0, -1, channels]))
         pixels = w.op("Gather", pixels, w.constant(seen, np.int32), axis=1)
+    elif max(kernel) > 1:  # a pixel is in one patch; its number there would be four bytes, in each model that has them
+        cut = [n for pair in zip(result, kernel, strict=True) for n in pair]
+        pixels = w.op("Reshape", pixels, w.constant([0, *cut[:-1], cut[-1] * channels]))
+        pixels = w.op("Transpose", pixels, perm=[0, *range(1, 2 * axes, 2), *range(2, 2 * axes + 1, 2)])
     rows = w.op("Reshape", pixels, w.constant([0, places, len(matrix)]))
     made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, NO_ZERO, *([bias] if bias else []), domain=DOMAIN)
     turned = w.op("Transpose", made, perm=[0, 2, 1])
