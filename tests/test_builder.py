@@ -224,6 +224,28 @@ def test_a_build_with_nothing_to_go_on_from_says_so(asked: dict[str, Any], direc
     assert told["resume"][0].endswith("there is nothing to go on from, so the build begins anew")
 
 
+@pytest.mark.parametrize("left", ["artifact", "again"])
+def test_what_a_killed_build_left_of_a_folder_that_it_removed_is_in_nobodys_way(
+    left: str, asked: dict[str, Any], directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without its manifest it is no artifact, and convert would not replace it."""
+    folder = building(directory) / left
+    folder.mkdir(parents=True)
+    (folder / "block_00.onnx").touch()
+    if left == "again":  # where the artifact that is gone on with is converted for comparison
+        shutil.copytree(directory, building(directory) / "artifact")
+        (building(directory) / "artifact" / STATE).touch()
+
+    def convert(_: object, made: Path, **how: Any) -> None:
+        assert made == folder and not made.exists()
+        shutil.copytree(directory, made)
+
+    monkeypatch.setattr(builder, "convert", convert)
+    recording = policies.record(directory.parent / "calls.npz")
+    ttscompile.build("policy.ckpt", directory, [recording], progress=False, resume=True)
+    assert "calibrate" in asked
+
+
 def test_two_builds_in_one_place_are_one_too_many(
     asked: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

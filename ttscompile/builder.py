@@ -10,6 +10,7 @@ from typing import Any
 
 from .artifact.files import aside, locked, writing
 from .artifact.load import load_artifact, read_manifest
+from .artifact.manifest import MANIFEST
 from .artifact.write import learned_plans, replacing
 from .calibration.arguments import require_rate
 from .calibration.budget import SPARSITY, Goal
@@ -163,6 +164,10 @@ def _convert(
     checkpoint: str | os.PathLike[str], directory: Path, resume: bool, explain: Explain, how: Mapping[str, Any]
 ) -> None:
     """Convert; where an interrupted build has done that, see that it was of this checkpoint, and leave it."""
+    again = directory.with_name("again")
+    for made in (directory, again):
+        if not (made / MANIFEST).is_file():  # killed while it was removed, that build left a part of it
+            shutil.rmtree(made, ignore_errors=True)
     if not (resume and (directory / STATE).is_file()):
         convert(checkpoint, directory, explain=explain, **how)
         if resume and _kept(directory).is_file():  # calibration sees that it is of this model
@@ -171,7 +176,6 @@ def _convert(
             explain("resume", (f"{directory}: there is nothing to go on from, so the build begins anew",))
         _kept(directory).unlink(missing_ok=True)
         return
-    again = directory.with_name("again")
     convert(checkpoint, again, explain=explain, **how)
     found, expected = (read_manifest(each).model_identity for each in (directory, again))
     shutil.rmtree(again, ignore_errors=True)

@@ -21,7 +21,8 @@ from typing import Any
 Operation = Callable[[Path], None]
 
 PREFIX = "ttscompile-kill-"
-_EVENTS = frozenset({"os.mkdir", "os.rename", "os.remove", "os.rmdir"})
+_BELOW = frozenset({"os.remove", "os.rmdir"})
+_EVENTS = _BELOW | {"os.mkdir", "os.rename"}
 _WRITING = os.O_WRONLY | os.O_RDWR
 
 
@@ -220,12 +221,12 @@ def _kill(
 
 def finish(operation: Callable[[], None]) -> None:
     """Run in a forked process, to its end."""
-    _, status = os.waitpid(_fork(operation), 0)
+    _, status = os.waitpid(fork(operation), 0)
     assert status == 0, f"a process that nobody killed ended with {status}"
 
 
 def _killed_after(operation: Callable[[], None], seconds: float) -> bool:
-    child = _fork(operation)
+    child = fork(operation)
     time.sleep(seconds)
     os.kill(child, signal.SIGKILL)
     return os.WIFSIGNALED(os.waitpid(child, 0)[1])
@@ -238,7 +239,7 @@ def killed_at(operation: Callable[[], None], event: int) -> bool:
         left = [event]
 
         def count(name: str, arguments: tuple[Any, ...]) -> None:
-            if _counts(name, arguments):
+            if changes_files(name, arguments):
                 left[0] -= 1
                 if left[0] == 0:
                     os.kill(os.getpid(), signal.SIGKILL)
@@ -246,7 +247,7 @@ def killed_at(operation: Callable[[], None], event: int) -> bool:
         sys.addaudithook(count)
         operation()
 
-    return os.WIFSIGNALED(os.waitpid(_fork(watched), 0)[1])
+    return os.WIFSIGNALED(os.waitpid(fork(watched), 0)[1])
 
 
 def events(operation: Callable[[], None]) -> int:
@@ -257,7 +258,7 @@ def events(operation: Callable[[], None]) -> int:
         events = [0]
 
         def count(name: str, arguments: tuple[Any, ...]) -> None:
-            events[0] += _counts(name, arguments)
+            events[0] += changes_files(name, arguments)
 
         sys.addaudithook(count)
         operation()
@@ -269,15 +270,17 @@ def events(operation: Callable[[], None]) -> int:
         return int(pipe.read())
 
 
-def _counts(name: str, arguments: tuple[Any, ...]) -> bool:
+def changes_files(name: str, arguments: tuple[Any, ...]) -> bool:
     """Whether an audit event is a change of the files of this test; between two of them nothing changes on disk."""
     if name == "ctypes.dlsym":
         return arguments[1] == "renameat2"
+    if name in _BELOW and arguments[1] != -1:  # a name below a folder that is held open, as when a tree is removed
+        return True
     writes = name in _EVENTS or (name == "open" and arguments[2] & _WRITING)
     return bool(writes) and any(PREFIX in str(each) for each in arguments[:2])
 
 
-def _fork(operation: Callable[[], None]) -> int:
+def fork(operation: Callable[[], None]) -> int:
     sys.stdout.flush()
     child = os.fork()
     if child == 0:

@@ -29,6 +29,16 @@ def test_killed_at_every_operation() -> None:
     assert [line["kills"] > 5 for line in found.values()] == [True, True, True, False]
 
 
+@pytest.mark.slow
+def test_builds_that_are_killed_twenty_times_and_resumed_end_with_the_same_bytes() -> None:
+    command = [sys.executable, "-m", "tests.hostile.kill_builds", "--kills", "20"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert result.returncode == 0, result.stdout + result.stderr
+    found = json.loads(result.stdout)
+    assert found["failures"] == [] and sum(found["killed"].values()) == 20
+    assert all(found["killed"].get(phase) for phase in found["moments"]), "a phase in which nothing was killed"
+
+
 def folder(path: Path, text: str) -> Path:
     path.mkdir()
     (path / "file").write_text(text)
