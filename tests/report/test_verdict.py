@@ -6,7 +6,7 @@ import pytest
 
 from ttscompile.measure import machine
 from ttscompile.measure.units import rounded_up
-from ttscompile.report.facts import chosen, remarks
+from ttscompile.report.facts import chosen, remarks, score_table
 
 ROW = {"told": "4 of 16 steps", "distance": 0.0512, "interval": [0.03, 0.071], "within": 0.0568, "milliseconds": 7.412}
 DENSE = {"name": "dense", "told": "all", "distance": 0.0, "interval": [0.0, 0.0], "milliseconds": 147.0, "worst": 150.0}
@@ -29,6 +29,17 @@ def test_without_a_deadline_the_longest_call_is_told() -> None:
 def test_the_distance_is_that_which_confirms_the_choice() -> None:
     (told,) = chosen(built(confirmed={"distance": 0.064, "interval": [0.04, 0.0912]}))
     assert told.startswith("Chosen among 2 plans: 4 of 16 steps: 0.064 of what other noise changes, 0.091 at worst;")
+
+
+def test_the_table_has_both_distances_where_there_are_two() -> None:
+    score = {"distance": 0.0512, "sparsity": 0.75, "flops_saved": 0.7}
+    record = built(confirmed={"distance": 0.064, "interval": [0.04, 0.0912]})
+    record["plans"] = {"schedule": score, "original.3": {**score, "distance": 0.09}}
+    table = score_table(record)
+    assert table.head[1:3] == ("distance from the original", "confirmed on other calls")
+    assert [row[:3] for row in table.rows] == [("schedule", "0.051", "0.064"), ("original.3", "0.090", "")]
+    table = score_table({**record, "frontier": built()["frontier"]})
+    assert table.head[2] == "mean action error" and table.rows[0][:2] == ("schedule", "0.051")
 
 
 def test_with_one_it_is_the_99th_percentile_of_what_is_allowed() -> None:

@@ -103,7 +103,8 @@ def _figures(artifact: Artifact, measured: Sequence[Measurement]) -> tuple[tuple
         ("residual blocks", str(len(manifest.blocks))),
     ]
     if (score := facts.scores(manifest.calibration, ("distance",)).get(manifest.default_plan)) is not None:
-        made.append(("distance from the original", f"{score['distance']:.3f}"))
+        distance = facts.confirmed(manifest.calibration or {}).get(manifest.default_plan, score["distance"])
+        made.append(("distance from the original", f"{distance:.3f}"))
     return tuple(made)
 
 

@@ -233,10 +233,12 @@ def plan_table(artifact: Artifact) -> Table:
 
 def score_table(record: Mapping[str, Any], without: Sequence[str] = ()) -> Table:
     """What calibration measured of plans on episodes that it did not learn from."""
+    again = confirmed(record)
     rows = [
         (
             marked(name),
             _figure(score, "distance", ".3f"),
+            *[_figure(again, name, ".3f")] * bool(again),
             _figure(score, "error"),
             _figure(score, "error_p90"),
             share(score["sparsity"]),
@@ -245,9 +247,14 @@ def score_table(record: Mapping[str, Any], without: Sequence[str] = ()) -> Table
         for name, score in scores(record).items()
         if name not in without
     ]
-    errors = "mean action error", "90th percentile"
-    head = ("held-out episodes", "distance from the original", *errors, "cells reused", "FLOPs saved")
-    return Table(head, tuple(rows))
+    distance = ("distance from the original", *["confirmed on other calls"] * bool(again))
+    errors = ("mean action error", "90th percentile", "cells reused", "FLOPs saved")
+    return Table(("held-out episodes", *distance, *errors), tuple(rows))
+
+
+def confirmed(record: Mapping[str, Any]) -> dict[str, float]:
+    """Distances by name of the plans that a build chose, on calls of the held-out episodes by which it chose none."""
+    return {row["name"]: row["confirmed"]["distance"] for row in record.get("frontier", ()) if "confirmed" in row}
 
 
 def calibration(manifest: Manifest) -> Section:
@@ -259,9 +266,8 @@ def calibration(manifest: Manifest) -> Section:
         held, of = (record.get(key, {}).get("validation") for key in ("calls", "episodes"))
         told = f" ({held} calls of {len(of)} episodes)" if held is not None and of is not None else ""
         errors = f"Errors of the actions, in their units, on recorded episodes that nothing was learned from{told}"
-        text.insert(
-            0, f"{errors}, against the dense policy with the same noise: the mean over calls, and the 90th percentile."
-        )
+        against = "against the dense policy with the same noise: the mean over calls, and the 90th percentile."
+        text.insert(0, f"{errors}, {against}")
         tables.insert(0, score_table(record, spare(manifest)))
     return Section("Calibration", tuple(text) or ("No errors were measured.",), tuple(tables))
 
