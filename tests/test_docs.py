@@ -25,6 +25,8 @@ import ttscompile
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.pages import EXTENDING, ROOT, examples, load
 from tests.passes.modules import MODULES, spec
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.calls import load_episodes
 from ttscompile.cli import main
 
 PAGES = examples.pages()
@@ -154,6 +156,17 @@ def test_a_page_can_be_followed(page: Path, request: pytest.FixtureRequest, tmp_
             exec(compile(code, str(page), "exec"), names)
         elif block.language == "console":
             follow(block)
+
+
+@pytest.mark.slow
+def test_the_recording_that_the_tutorial_writes_by_hand_is_read(
+    compiled_layer: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = ["\n".join(block.lines) for block in BLOCKS if block.page == TUTORIAL and block.language == "python"]
+    monkeypatch.chdir(tmp_path)
+    exec(next(each for each in code if "np.savez" in each), {})
+    episodes = load_episodes(load_artifact(compiled_layer).manifest.spec, ["calls.npz"], None)
+    assert [each.calls for each in episodes] == [30] * 16
 
 
 def follow(block: Any) -> None:
