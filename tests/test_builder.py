@@ -334,10 +334,11 @@ def test_a_checkpoint_becomes_a_policy(
     assert instructed not in result.output
     (dense,) = (row for row in record["frontier"] if row["name"] == "dense")
     dense["distance"] = -1e-9  # rounding
+    chosen |= {"near": False, "confirmed": {"distance": 0.3, "interval": [0, 1]}}  # too far on other calls
     monkeypatch.setattr(summary, "instruct_of", lambda each: each is artifact)  # of a policy that is told its task
-    summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO())), 1)
+    summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO()), width=200), 1)
     assert instructed in printed.getvalue() and "AsyncExecutor" not in printed.getvalue()
-    assert "-0.000" not in printed.getvalue()
+    assert "-0.000" not in printed.getvalue() and printed.getvalue().count("0.300 too far") == 1
     summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO())), 1, control_hz=50.0)
     loop = printed.getvalue().partition("    with ttscompile.")[2].splitlines()
     assert loop[0] == "AsyncExecutor(policy, control_hz=50) as executor:"

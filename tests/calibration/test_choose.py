@@ -16,7 +16,7 @@ from ttscompile.calibration.choose import choose, weights_read
 from ttscompile.calibration.judge import Score
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.proposer import least_bound
+from ttscompile.calibration.proposer import Proposal, least_bound
 from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.state import FILE
 from ttscompile.calibration.trials import CONFIRMING, HELD_OUT, Trials
@@ -215,7 +215,10 @@ def test_what_another_machine_may_choose_is_kept_beside(
         "ttscompile.calibration.choose.timed",
         lambda entrants, threads, rounds=3: [Times((times[names[id(plan)]][2],) * rounds) for _, plan in entrants],
     )
+    refused = kept.farther["z"] = replace(trials.base), score_of(0.6)
+    names[id(refused[0])], times["z"] = "z", (0.6, 0.6, 0.5)
     found = choose(kept, request(bound=0.1, farthest=0.25))
+    assert found.tried[0].items() >= {"name": "z", "distance": 0.6, "milliseconds": 0.5, "near": False}.items()
     assert {name: names[id(plan)] for name, plan in found.plans.items() if name != DENSE} == {
         "schedule": "c",
         "safe": "e",
@@ -225,6 +228,17 @@ def test_what_another_machine_may_choose_is_kept_beside(
     assert {row["name"] for row in found.tried if row["kept"]} == {DENSE, "schedule", "safe", "fast", "f"}
     assert [row["name"] for row in found.tried if row["spare"]] == ["f"]
     assert found.scores.keys() == {"schedule", "safe", "fast", "f"}, "which 'bench --choose' reads"
+
+
+def test_what_is_too_far_is_shown_until_a_plan_of_its_name_is_kept(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    monkeypatch.setattr("ttscompile.calibration.kept.judge", lambda *_: score_of(0.6))
+    kept = Kept(trials_of(artifact, [recording]), anew=True)
+    proposal = Proposal("a", replace(kept.trials.base), beside=True, refusal=lambda *_: "is too far")
+    assert kept.consider(proposal) == "is too far" and kept.farther["a"][0] is proposal.plan
+    assert kept.consider(replace(proposal, refusal=lambda *_: None)) is None
+    assert not kept.farther and kept.plans["a"] is proposal.plan
 
 
 def test_a_distance_that_is_estimated_below_0_ends_the_frontier(

@@ -116,6 +116,14 @@ def test_the_frontier_of_one_point_is_no_line_and_the_dense_plan_is_told() -> No
     assert "dense of s, 99 ms" in figure.axes[0].get_title(loc="left")
 
 
+def test_what_may_not_be_taken_is_a_grey_ring() -> None:
+    points = [Point("too far", "a", 0.5, 5.0), Point("may be taken", "b", 0.05, 9.0)]
+    figure = plot_frontier(points, points[1:], "title", "too far")
+    looks = [(str(line.get_fillstyle()), str(line.get_color())) for line in figure.axes[0].lines]
+    assert looks == [("none", "#999999"), ("full", "#0072b2")]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["too far", "may be taken"]
+
+
 def test_many_series_are_told_apart_and_the_original_but_for_rounding_takes_no_room() -> None:
     points = [Point(f"rule {i}", "0.95", 0.5 + 0.05 * i, 5.0 + i) for i in range(9)]
     axes = frontier_of([*points, Point("s", "dense", 2e-7, 99.0)]).axes[0]

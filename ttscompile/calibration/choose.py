@@ -36,11 +36,11 @@ class Frontier:
     """What was tried, and what was chosen.
 
     Attributes:
-        tried: all plans, fastest first, the original among them; JSON. ``name`` is that in the artifact, or what it was
-            called while it was tried; ``told`` what it does, in words; ``distance`` and ``interval`` how far it is from
-            the original on held-out episodes, with 95 % limits (``judge``), ``within`` the least bound that allows
-            that, and ``confirmed`` the first two on other calls of these episodes, for what was chosen;
-            ``milliseconds`` and ``worst`` the median and ``Times.worst`` of its ``calls`` on this machine, in
+        tried: all plans, fastest first, the original and those too far away among them; JSON. ``name`` is that in the
+            artifact, or what it was called while it was tried; ``told`` what it does, in words; ``distance`` and
+            ``interval`` how far it is from the original on held-out episodes, with 95 % limits (``judge``), ``within``
+            the least bound that allows that, and ``confirmed`` the first two on other calls of these episodes, for what
+            was chosen; ``milliseconds`` and ``worst`` the median and ``Times.worst`` of its ``calls`` here, in
             milliseconds; ``weights`` the bytes of those that its models read; ``near`` whether it is within
             ``Request.farthest``; ``kept`` whether the artifact gets it, and ``spare`` whether it does so for other
             machines.
@@ -71,8 +71,9 @@ def seconds_to_time(kept: Kept, deadline_ms: float | None) -> float:
     trials = kept.trials
     rounds = (WARM_UP + TIMED) * (1 if trials.artifact.manifest.precision is None else 2)
     slower = max(1.0, trials.clock.paces.get(True, 1.0))  # than when the loops were timed
-    a_round = sum(call_seconds(trials, plan) for name, plan in kept.plans.items() if name != FULL)
-    confirming = sorted(seconds_to_judge(trials, plan, CONFIRMING) for name, plan in kept.plans.items() if name != FULL)
+    plans = [plan for name, plan in kept.plans.items() if name != FULL]
+    a_round = sum(call_seconds(trials, plan) for plan in (*plans, *(plan for plan, _ in kept.farther.values())))
+    confirming = sorted(seconds_to_judge(trials, plan, CONFIRMING) for plan in plans)
     return slower * rounds * a_round + 2 * TIMED_LONG * (deadline_ms or 0.0) / 1e3 + sum(confirming[-CHOSEN:])
 
 
@@ -153,6 +154,8 @@ class _Entrants:
                 own = variant if name in self.plans else name  # the first takes the place of what was left out
                 self.plans[own], self.scores[own] = one, score
                 bar.update(len(self.plans), f"{own}: {score.distance:.3g}", clock.left())
+        for name, (plan, score) in kept.farther.items():  # never chosen, and yet shown
+            self.plans[name], self.scores[name] = plan, score
         bar.stage("timing", 1)
         each = timed([(self._trials, plan) for plan in self.plans.values()], request.threads)
         self.times = dict(zip(self.plans, each, strict=True))

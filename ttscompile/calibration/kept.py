@@ -34,6 +34,7 @@ class Kept:
         weights, starts: what plans name that the artifact had not, by name.
         pruner: constants, and the loop whose pruner has them; None where they stay.
         refused: why plans, or all that a proposer proposed, are left out, by name; begins with a verb.
+        farther: those of these plans that were proposed beside others, with their scores, by name.
         told: by proposer, a sentence on what became of it.
         shared: by proposer, the fields that it gave to all plans.
         learned: whether any proposal but those ``beside`` was kept.
@@ -52,6 +53,7 @@ class Kept:
         self.starts: dict[str, StartRecord] = {}
         self.pruner: tuple[Mapping[str, npt.NDArray[Any]], str] | None = None
         self.refused: dict[str, str] = {}
+        self.farther: dict[str, tuple[Plan, Score]] = {}
         self.told: dict[str, str] = {}
         self.shared: dict[str, dict[str, Any]] = {}
         self.learned = False
@@ -121,8 +123,11 @@ class Kept:
         if reason is not None:
             if proposal.name not in self.judged:  # one of that name that was kept before stays
                 self.refused[proposal.name] = reason
+                if proposal.beside:
+                    self.farther[proposal.name] = proposal.plan, score
             return reason
         self.refused.pop(proposal.name, None)
+        self.farther.pop(proposal.name, None)
         self.plans[proposal.name], self.scores[proposal.name] = proposal.plan, score
         self.judged[proposal.name] = proposal.plan
         if proposal.plan.exact is proposal.plan:

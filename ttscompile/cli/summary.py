@@ -69,10 +69,9 @@ def print_frontier(
     record, default = artifact.manifest.calibration or {}, artifact.manifest.default_plan
     rows = record["frontier"]
     dense = next(row for row in rows if row["name"] == DENSE)
-    made = table(
-        "plan", "what it does", "ms a call", "longest", "times faster", "MB", "distance", "95 %", "confirmed", ""
-    )
+    made = table("plan", "what it does", "ms a call", "longest", "times faster", "MB", "distance", "95 %", "confirmed")
     for row in rows:
+        again = [f"{round(row['confirmed']['distance'], 3) + 0:.3f}"] if "confirmed" in row else []
         made.add_row(
             f"{row['name']} (default)" if row["name"] == default else row["name"],
             row["told"],
@@ -82,8 +81,7 @@ def print_frontier(
             f"{row['weights'] / 1e6:.1f}",
             f"{round(row['distance'], 3) + 0:.3f}",  # + 0: never -0
             "..".join(f"{round(one, 3) + 0:.3f}" for one in row["interval"]),
-            f"{round(row['confirmed']['distance'], 3) + 0:.3f}" if "confirmed" in row else "",
-            "" if row["near"] else "too far",
+            " ".join([*again, *["too far"] * (not row["near"])]),
         )
     made.columns[1].justify = "left"
     output.print(made)

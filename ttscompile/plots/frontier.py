@@ -30,10 +30,11 @@ ROUNDING = 1e-4
 _TITLE_WIDTH = 105  # characters
 
 
-def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: str) -> Figure:
+def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: str, hollow: str = "") -> Figure:
     """The points of all series, and a line along ``efficient``, those that no other beats, the fastest first.
 
-    Those at no distance but rounding (the dense policy) are told in the title.
+    Those of the series ``hollow`` are grey rings. Those at no distance but rounding (the dense policy) are told in the
+    title.
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()
@@ -46,7 +47,8 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
             marker=MARKERS[(i + i // len(COLOURS)) % len(MARKERS)],  # of a colour that comes again, another
             linestyle="none" if len({p.name.strip("0123456789.") for p in own}) > 1 else "-",
             linewidth=1,
-            color=COLOURS[i % len(COLOURS)],
+            color="#999999" if series == hollow else COLOURS[i % len(COLOURS)],
+            fillstyle="none" if series == hollow else "full",
             label=series,
         )
     first, last = (log(end([p.latency_ms for p in shown], default=1.0)) for end in (min, max))

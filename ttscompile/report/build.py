@@ -27,6 +27,10 @@ from .usage import Course, run_episode
 NOT_RUN = Section("Verification", ("Not run for this page: --verify adds it, ttscompile verify DIR runs it alone.",))
 
 
+_TOO_FAR = "too far"
+"""Of what a build tried, the series of plans that it could not take."""
+
+
 @dataclass(frozen=True)
 class Extras:
     """What a report shows beside the artifact.
@@ -203,8 +207,8 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
         text = "Distances from the calibration record, latencies measured now. ttscompile bench -t measures both."
     if not any(point.distance > 0 for point in points):
         return Section("Comparison", ("There is no distance to hold against a latency: calibrate the artifact first.",))
-    best = efficient(points)
-    png = encoded(plot_frontier(points, best, f"artifact {manifest.short_identity}"))
+    best = efficient([point for point in points if point.series != _TOO_FAR])
+    png = encoded(plot_frontier(points, best, f"artifact {manifest.short_identity}", _TOO_FAR))
     alt = "Points: distance from the original against latency of each plan. The table has the figures."
     drawn = Picture(png, "Distance from the original against latency: down and left is better.", alt)
     rows = tuple((p.series, p.name, f"{p.distance:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
@@ -216,7 +220,7 @@ def _tried(row: Mapping[str, Any]) -> Point:
     """A plan that a build tried; the distance of the original is 0 but for rounding."""
     if row["name"] == DENSE:
         return Point("the original", DENSE, 0.0, row["milliseconds"])
-    nearness = "may be taken" if row["near"] else "too far"
+    nearness = "may be taken" if row["near"] else _TOO_FAR
     return Point(nearness, row["name"], max(float(row["distance"]), 0.0), row["milliseconds"])
 
 
