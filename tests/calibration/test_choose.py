@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import ttscompile
 from tests.calibration import policies
@@ -239,6 +240,30 @@ def test_what_is_too_far_is_shown_until_a_plan_of_its_name_is_kept(
     assert kept.consider(proposal) == "is too far" and kept.farther["a"][0] is proposal.plan
     assert kept.consider(replace(proposal, refusal=lambda *_: None)) is None
     assert not kept.farther and kept.plans["a"] is proposal.plan
+
+
+@pytest.mark.parametrize(
+    ("cores", "threads", "two", "told"),
+    [
+        (2, 1, 2.0, "with two a call of 'schedule' takes 2 ms in place of 3"),
+        (2, 1, 2.6, ""),
+        (1, 1, 2.0, ""),
+        (2, 2, 2.0, ""),
+    ],
+)
+def test_where_two_threads_are_faster_it_is_told(
+    cores: int, threads: int, two: float, told: str, monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    kept = Kept(trials_of(artifact, [recording]), anew=True)
+    kept.plans["a"] = replace(kept.trials.base)
+    monkeypatch.setattr("ttscompile.calibration.choose.judge", lambda *_: score_of(0.01))
+    monkeypatch.setattr(
+        "ttscompile.calibration.choose.timed",
+        lambda entrants, threads, *_: [Times(((3.0, two)[threads - 1],))] * len(entrants),
+    )
+    torch.set_num_threads(cores)
+    choose(kept, request(threads=threads))
+    assert kept.told["threads"].partition(":")[0] == told
 
 
 def test_a_distance_that_is_estimated_below_0_ends_the_frontier(

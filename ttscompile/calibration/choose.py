@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
+
 from ..artifact.corrections import correction_arrays
 from ..artifact.load import Artifact
 from ..artifact.onnx_files import weight_bytes
@@ -13,6 +15,7 @@ from ..core.plan import DENSE, FULL, SCHEDULE, Plan
 from ..errors import CalibrationFailedError
 from ..ir.pieces import LAYERS, is_of_loop
 from ..measure.points import ALIKE, best_plan, fastest
+from ..measure.units import ms
 from .judge import TIMED, WARM_UP, Score, call_seconds, judge, seconds_to_judge, timed
 from .kept import Kept
 from .proposer import SAFER, Request, least_bound
@@ -123,6 +126,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
     spare = entrants.spare(named, allowed)
     others = [plan.otherwise for plan in (*plans.values(), *spare.values())]
     plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other for other in others)}
+    kept.told["threads"] = entrants.told_of_threads(chosen)
     held = {**named, DENSE: DENSE} if default == DENSE else named
     judged = {held[name]: scores[name] for name in held} | {name: scores[name] for name in spare}
     return Frontier(entrants.rows(named, allowed, spare), plans, spare, judged, default)
@@ -212,6 +216,14 @@ class _Entrants:
             if (found := best_plan({name: self.times[name] for name in two}, self.distances, deadline)) is not None:
                 return found
         return None
+
+    def told_of_threads(self, name: str) -> str:
+        """By how much calls of a plan are faster with two threads; nothing where they are not, or 36 take too long."""
+        if self._request.threads > 1 or torch.get_num_threads() < 2 or self.median(name) > 40:
+            return ""  # torch has as many as there are cores
+        one, two = (timed([(self._trials, self.plans[name])], threads)[0].median for threads in (1, 2))
+        told = f"with two a call of {SCHEDULE!r} takes {ms(two)} ms in place of {ms(one)}"
+        return f"{told}: build with --threads 2, and load with threads=2" if ALIKE * two < one else ""
 
     def nearest(self, allowed: Sequence[str], close: Sequence[str]) -> str:
         """What is nearest of the plans that are not near enough; with a warning, since ``dense`` is the default."""

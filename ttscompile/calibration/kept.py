@@ -35,7 +35,7 @@ class Kept:
         pruner: constants, and the loop whose pruner has them; None where they stay.
         refused: why plans, or all that a proposer proposed, are left out, by name; begins with a verb.
         farther: those of these plans that were proposed beside others, with their scores, by name.
-        told: by proposer, a sentence on what became of it.
+        told: by proposer, a sentence on what became of it; and one on ``threads``.
         shared: by proposer, the fields that it gave to all plans.
         learned: whether any proposal but those ``beside`` was kept.
     """
