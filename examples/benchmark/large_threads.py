@@ -55,6 +55,7 @@ def alone(folder: Path, what: str, calls: Callable[[int], Call], threads: Sequen
         actions = made[0][0]
         parts = ", ".join(f"{part:.2f}" for part in found[-1])
         print(f"{sum(found[-1]):8.2f} s  {what} on {count}: {parts}; {waited()}")
+        del own  # there may be no memory for two of them
     np.savez(folder / f"{what}.npz", actions=actions, seconds=found, threads=threads)
 
 
