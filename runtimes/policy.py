@@ -171,8 +171,8 @@ class CompiledPolicy:
         """
         with self._turn():
             obs, example = self._read(obs_dict)
-            predicted, chunk = self._predict(obs, noise, plan, prefix), self._spec.chunk
-            executed = predicted[:, chunk.start : chunk.stop]
+            predicted = self._predict(obs, noise, plan, prefix)
+            executed = self._spec.chunk.executed(predicted)
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
 
     def prepare_frame(self, frame: Mapping[str, Any], stop: Callable[[], bool] = lambda: False) -> FrameWork:
@@ -299,8 +299,8 @@ class CompiledPolicy:
 
     def _chunk(self, obs: Mapping[str, Array], noise: Noise | None, plan: AnyPlan, prefix: Any = None) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
-        chunk = self._spec.chunk
-        return self._predict(obs, noise, plan, prefix)[:, chunk.start : chunk.stop]
+        executed: FloatArray = self._spec.chunk.executed(self._predict(obs, noise, plan, prefix))
+        return executed
 
     def _predict(self, obs: Mapping[str, Array], noise: Noise | None, plan: AnyPlan, prefix: Any) -> FloatArray:
         """One call; the actions ``[B, T, Da]``, which are finite."""

@@ -99,7 +99,7 @@ def _call(artifact: Artifact) -> list[Finding]:
     chunk = artifact.manifest.spec.chunk
     median = statistics.median(times[1:])
     took = f"{median:.1f} ms with one thread (the first {times[0]:.1f})"
-    told = f"{took}, for {chunk.stop - chunk.start} actions: {1000 / median:.1f} calls a second"
+    told = f"{took}, for {chunk.executes} actions: {1000 / median:.1f} calls a second"
     return [Finding(PART, "call", told)]
 
 

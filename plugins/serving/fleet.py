@@ -135,7 +135,7 @@ class FleetServer(Listener):
         chunk = self._manifest.spec.chunk
         return {
             "observation": {key: {"shape": list(one.shape), "dtype": one.dtype} for key, one in self._specs.items()},
-            "action": {"shape": [chunk.stop - chunk.start, chunk.action_dim], "dtype": "float32"},
+            "action": {"shape": [chunk.executes, chunk.action_dim], "dtype": "float32"},
             "identity": self._manifest.identity,
             "max_message_bytes": self._limits.message_bytes,
             "idle_timeout": self._limits.idle_timeout,

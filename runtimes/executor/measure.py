@@ -49,7 +49,7 @@ class MonotonicClock:
 def require_plans(policy: Policy, settings: Resolved) -> None:
     """Raise ExecutorError unless every plan that calls may run goes with the seam and the horizon; warn of losses."""
     info, plans = policy.info, getattr(policy, "plans", None)
-    executed = info.action.stop - info.action.start
+    executed = info.action.executes
     for name in settings.plans:
         if settings.seam == "prefix":
             _require_prefix(policy, settings, name)

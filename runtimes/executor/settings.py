@@ -264,7 +264,7 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         raise ExecutorError(f"{what}: {lasts}. Run the loop at a multiple of the policy's rate{other}.")
     chunk, tiers = info.action, settings.tiers or (info.default_plan,)
     longest = info.sample[0] - chunk.start
-    horizon = settings.horizon or chunk.stop - chunk.start
+    horizon = settings.horizon or chunk.executes
     if horizon > longest:
         predicted = f"{info.sample[0]} actions, {longest} of them from the observation on"
         raise ExecutorError(f"horizon = {horizon}: the policy predicts {predicted}. Give at most {longest}.")

@@ -203,7 +203,7 @@ def _wanted_of(
         "path": projected,
         "sample": sample,
         "actions": (streams, spec.sample[0], spec.chunk.action_dim),
-        "executed": (streams, spec.chunk.stop - spec.chunk.start, spec.chunk.action_dim),
+        "executed": (streams, spec.chunk.executes, spec.chunk.action_dim),
     }
     if spec.sampler.stochastic:
         float32["draws"] = (steps, *sample)

@@ -83,7 +83,7 @@ def late_calls(runner: Runner, calls: Calls, seed: int) -> Calls:
     """The first of some answered calls once more, with other noise and as a prefix some of the actions executed."""
     spec, count = runner.view.manifest.spec, calls.count // LATE
     initial, noise = draw_noise(spec, count, (seed, 2, 1))
-    answers = calls.targets[:count, spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim].numpy()
+    answers = spec.chunk.executed(calls.targets[:count]).numpy()
     known = known_samples(spec, answers, initial.numpy())
     lengths = np.random.default_rng((seed, 2, 2)).integers(1, answers.shape[1] + 1, (count, 1))
     assert known is not None

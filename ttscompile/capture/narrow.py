@@ -69,7 +69,7 @@ def needed(module: nn.Module, spec: PolicySpec) -> int | None:
     None where all are needed, for the module takes no fewer or its first steps depend on the last.
     """
     (horizon, _), chunk = spec.sample, spec.chunk
-    kept = min(chunk.stop + (chunk.stop - chunk.start + 1) // 2, horizon)
+    kept = min(chunk.stop + (chunk.executes + 1) // 2, horizon)
     try:
         return kept if chunk.stop < horizon and _difference(module, spec, chunk.stop) <= TOLERANCE else None
     except SpecError:

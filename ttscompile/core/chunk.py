@@ -190,8 +190,13 @@ class ChunkSpec:
             scale[..., one.channel], offset[..., one.channel] = 2 / width, -(one.above + one.below) / width
         return Affine(scale, offset)
 
+    @property
+    def executes(self) -> int:
+        """Ta: how many steps of the chunk are executed."""
+        return self.stop - self.start
+
     def executed(self, samples: Any) -> Any:
-        """The executed part ``[..., Ta, Da]`` of denoised samples ``[..., T, D]``, normalised as these are."""
+        """The executed part ``[..., Ta, Da]`` of denoised samples ``[..., T, D]``, or of actions ``[..., T, Da]``."""
         return samples[..., self.start : self.stop, : self.action_dim]
 
     def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:

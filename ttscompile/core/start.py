@@ -41,7 +41,7 @@ class Start:
             executed: how many steps of it were executed; None for all that are to be.
             change: see ``ChunkSpec.moved``.
         """
-        executed = chunk.stop - chunk.start if executed is None else executed
+        executed = chunk.executes if executed is None else executed
         moved = chunk.moved(before, executed, change)
         initial = np.float32(self.action) * moved + np.float32(self.noise) * fresh.initial
         return Noise(initial, None if fresh.steps is None else fresh.steps[self.skipped :])

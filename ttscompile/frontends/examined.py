@@ -20,7 +20,7 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
     """Look at a checkpoint that was loaded with this specification; see ``convert`` for ``encoders``."""
     cameras = [f"{key} {list(one.shape)}" for key, one in spec.observations.items() if one.image]
     others = [f"{key} {list(one.shape)}" for key, one in spec.observations.items() if not one.image]
-    executed = spec.chunk.stop - spec.chunk.start
+    executed = spec.chunk.executes
     chunk = f"{spec.chunk.action_dim} numbers; {executed} of {spec.sample[0]} predicted steps are executed"
     found = [
         Finding(PART, "cameras", f"{len(cameras)}, in this order: {', '.join(cameras) or 'none'}"),

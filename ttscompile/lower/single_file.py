@@ -262,7 +262,7 @@ def _of_every_policy(program: Program) -> tuple[Values, Values]:
         tensor("rollout_keep", np.bool_, [steps, count]),
     ]
     outputs = [
-        tensor("action", np.float32, ["B", chunk.stop - chunk.start, chunk.action_dim]),
+        tensor("action", np.float32, ["B", chunk.executes, chunk.action_dim]),
         tensor("action_pred", np.float32, ["B", horizon, chunk.action_dim]),
         tensor("executed_plan", np.int8, ["B", steps, count]),
         tensor("legalised", np.int64, ["B"]),

@@ -116,8 +116,7 @@ def episodes_of(
     tokenizer: ReadTokenizer | None = None,
 ) -> list[Episode]:
     """Recorded episodes as a policy observes them, with a call for each chunk that it executes."""
-    executed = spec.chunk.stop - spec.chunk.start
-    return load_trajectories(paths, spec.observations, executed, sources, spec.instruction, tokenizer)
+    return load_trajectories(paths, spec.observations, spec.chunk.executes, sources, spec.instruction, tokenizer)
 
 
 def local_path(path: str | os.PathLike[str]) -> Path:

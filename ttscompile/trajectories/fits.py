@@ -188,8 +188,8 @@ def _pairs(missing: Sequence[str], free: Sequence[str]) -> dict[str, str]:
 
 
 def _rate(path: Path, spec: PolicySpec) -> list[Finding]:
-    executed = spec.chunk.stop - spec.chunk.start
     if (rate := rate_of(path)) is None:
         return []
+    executed = spec.chunk.executes
     told = f"{rate:g} Hz: {executed} steps are executed in {executed / rate:.2g} s, before the next look"
     return [Finding.judged(PART, "rate", told, executed / rate > _BLIND_SECONDS, "Lower n_action_steps.")]

@@ -191,8 +191,7 @@ def check_preprocessing(artifact: Artifact, golden: Golden) -> Rung:
     for key, one in spec.observations.items():
         errors[f"observation {key!r}"] = largest(one.normalized(raw[key]), network[key])
     errors["the action"] = largest(spec.chunk.unnormalized(golden.sample, spec.chunk.reference(raw)), golden.actions)
-    executed = golden.actions[:, spec.chunk.start : spec.chunk.stop]
-    errors["the executed part of the chunk"] = largest(executed, golden.executed)
+    errors["the executed part of the chunk"] = largest(spec.chunk.executed(golden.actions), golden.executed)
     wrong = [name for name, error in errors.items() if not error <= EXACT]
     observed = f"{len(raw)} observation{'s' * (len(raw) != 1)}"
     told = f"normalisers of {observed} and of the action, and the chunk, are the original's"

@@ -125,7 +125,7 @@ class _Recorder:
             path=np.stack([project(one, 0) for one in (*given[1:], sample)]),
             sample=sample,
             actions=actions,
-            executed=actions[:, spec.chunk.start : spec.chunk.stop],
+            executed=spec.chunk.executed(actions),
         )
 
     def _run(self, spec: PolicySpec, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -53,7 +53,7 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
             remedy = f"Was it trained so? lerobot says nothing. {REPEAT}"
             doubts.append(Finding(PART, f"normaliser of {name}", told, level, remedy))
     doubts += _embodiment(steps)
-    wanted, executed = entries.get("n_action_steps"), spec.chunk.stop - spec.chunk.start
+    wanted, executed = entries.get("n_action_steps"), spec.chunk.executes
     if isinstance(wanted, int) and wanted > executed:
         told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
         remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."

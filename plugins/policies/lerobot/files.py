@@ -55,7 +55,7 @@ def files_beside(directory: Path, spec: PolicySpec, text: bool = False) -> dict[
     config = {
         "type": "ttscompile",
         "n_obs_steps": max(one.frames or 1 for one in spec.observations.values()),
-        "n_action_steps": spec.chunk.stop - spec.chunk.start,
+        "n_action_steps": spec.chunk.executes,
         "input_features": {key: feature for key, feature in features.items() if key in spec.observations},
         "output_features": {ACTION: entries["output_features"][ACTION]},
         "device": "cpu",
