@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy.typing as npt
 import torch
 
+from ttscompile.core.coercion import Array
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType, backward_slice, copied
 from ttscompile.ir.operations import Movement, operation
@@ -15,7 +15,7 @@ from ttscompile.ir.program import Phase, mapped
 from .base import Pass, PassResult
 
 AnyPhase = TypeVar("AnyPhase", bound=Phase)
-Weights = dict[str, npt.NDArray[Any]]
+Weights = dict[str, Array]
 
 _CAST = "aten._to_copy.default"
 

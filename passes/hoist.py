@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import ORIGINAL, SamplerTable
 from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import evaluator
@@ -125,7 +124,7 @@ def _step_graph(
     return step, list(step.inputs), prologue
 
 
-def _evaluate_tables(prologue: Graph, names: list[str], program: Cut) -> dict[str, dict[str, npt.NDArray[Any]]]:
+def _evaluate_tables(prologue: Graph, names: list[str], program: Cut) -> dict[str, dict[str, Array]]:
     """By loop, rows of every table value, ``[K, *shape at a batch of one]``."""
     loops, timestep = program.spec.all_loops, program.spec.timestep_argument
     if not names:
@@ -134,7 +133,7 @@ def _evaluate_tables(prologue: Graph, names: list[str], program: Cut) -> dict[st
     graph = replace(graph, inputs={timestep: prologue.inputs[timestep]})  # which says that the batch is one
     run = evaluator(graph, program.weights)
 
-    def rows_of(sampler: SamplerTable) -> dict[str, npt.NDArray[Any]]:
+    def rows_of(sampler: SamplerTable) -> dict[str, Array]:
         steps = [run({timestep: t[None]}) for t in torch.from_numpy(sampler.timesteps)]
         by_name = zip(names, zip(*steps, strict=True), strict=True)
         return {name: np.stack([row.contiguous().numpy() for row in rows]) for name, rows in by_name}

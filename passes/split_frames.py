@@ -5,9 +5,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from ttscompile.core.coercion import Arrays
 from ttscompile.core.spec import COMMITTED, ObservationSpec
 from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.evaluate import drawn, evaluator
@@ -313,9 +313,7 @@ def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:
     return replace(backward_slice(whole, graph.outputs, {}), inputs=inputs)
 
 
-def _one_frame_a_row(
-    graph: Graph, tower: _Tower, lengths: Mapping[str, int], weights: Mapping[str, npt.NDArray[np.generic]]
-) -> bool:
+def _one_frame_a_row(graph: Graph, tower: _Tower, lengths: Mapping[str, int], weights: Arrays) -> bool:
     """Whether another frame of an observation changes no row that a third one changes."""
     if tower.rows == 1:
         return True
@@ -333,13 +331,13 @@ def _one_frame_a_row(
     return bool((changes <= 1).all())
 
 
-def _require_apart(each: SplitFrames, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> None:
+def _require_apart(each: SplitFrames, tower: Graph, weights: Arrays) -> None:
     """Raise unless a row gives the same beside another and alone."""
     for output in _beside(tower, weights):
         raise each.fail(f"%{output} of a row depends on the other rows.")
 
 
-def _beside(graph: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> list[str]:
+def _beside(graph: Graph, weights: Arrays) -> list[str]:
     """The outputs whose second half, for two rows or streams, is not what the second one gives alone."""
     run, rng = evaluator(graph, weights), np.random.default_rng(0)
     rows = {name: drawn(type_, 2, rng) for name, type_ in graph.inputs.items()}

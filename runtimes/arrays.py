@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ttscompile.core.coercion import Array, integer, is_tensor, plain
+from ttscompile.core.coercion import Array, Arrays, integer, is_tensor, plain
 from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
 from ttscompile.core.values import check_numbers, check_values, fitted
 from ttscompile.errors import ObservationError, TtscompileError
@@ -62,7 +62,7 @@ def read_observation(
     return arrays, example
 
 
-def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
+def check_observation(arrays: Arrays, specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
     """Copies of arrays ``[B, ...]`` of their specified shapes and dtypes, with numbers that can be, and one B.
 
     They are copied before their numbers are looked at: another thread may write into the caller's.

@@ -25,7 +25,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from ttscompile.artifact.manifest import PieceRecord
-from ttscompile.core.coercion import Array
+from ttscompile.core.coercion import Array, Arrays
 from ttscompile.ir.pieces import FRAMES, SCENE, frame_pieces
 
 from .tokens import Lane, Run, Seen, TokenTower, TokenWork
@@ -183,11 +183,11 @@ class FramePieces:
         for tower in self._tokens.values():
             tower.forget()
 
-    def learn(self, obs: Mapping[str, Array], stop: Stop = lambda: False) -> FrameWork:
+    def learn(self, obs: Arrays, stop: Stop = lambda: False) -> FrameWork:
         """Compute what is new in normalised observations ``[B, ...]``, until ``stop`` says so; no scene."""
         return self._learned(obs, stop)[0]
 
-    def values(self, obs: Mapping[str, Array]) -> dict[str, Array]:
+    def values(self, obs: Arrays) -> dict[str, Array]:
         """What the condition piece reads beside normalised observations ``[B, ...]``, and what the scene gives."""
         self.work, known = self._learned(obs, lambda: False)
         found = dict[str, Array]()
@@ -210,7 +210,7 @@ class FramePieces:
         self.work += replace(work, computed=0, remembered=0, scenes=done, scenes_remembered=before)
         return found | dict(zip(scene.outputs, self._memory[SCENE].values(contents), strict=True))
 
-    def _learned(self, obs: Mapping[str, Array], stop: Stop) -> tuple[FrameWork, dict[str, list[Content]]]:
+    def _learned(self, obs: Arrays, stop: Stop) -> tuple[FrameWork, dict[str, list[Content]]]:
         """What was done for new rows, until ``stop`` said so; and the contents of all rows, by piece."""
         rows, work, known = self._rows_of(obs), FrameWork(), dict[str, list[Content]]()
         for name, piece in self._pieces.items():
@@ -219,7 +219,7 @@ class FramePieces:
             work += self._memory[name].learn(known[name], self._compute(name, piece, own, len(own[0]), lanes), stop)
         return work, known
 
-    def _rows_of(self, obs: Mapping[str, Array]) -> dict[str, Array]:
+    def _rows_of(self, obs: Arrays) -> dict[str, Array]:
         if self._rows is None:
             return {}
         feed = {name: np.ascontiguousarray(obs[name]) for name in self._rows.inputs}
@@ -240,7 +240,7 @@ class FramePieces:
 
         return compute
 
-    def _lanes_of(self, name: str, obs: Mapping[str, Array]) -> Sequence[Lane]:
+    def _lanes_of(self, name: str, obs: Arrays) -> Sequence[Lane]:
         """The lane of each row of a frame piece that reuses tokens: of frames of one camera of one stream the same.
 
         Rows are made by moving numbers. So if every camera of every stream shows one number, the rows tell which.

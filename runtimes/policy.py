@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.core.coercion import Array, integer
+from ttscompile.core.coercion import Array, Arrays, integer
 from ttscompile.core.plan import Plan
 from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import NonFiniteActionsError, TtscompileError
@@ -297,12 +297,12 @@ class CompiledPolicy:
         given = given if self._instruct is None else self._instruct(given)
         return read_observation(given, self._spec.observations, others)
 
-    def _chunk(self, obs: Mapping[str, Array], noise: Noise | None, plan: AnyPlan, prefix: Any = None) -> FloatArray:
+    def _chunk(self, obs: Arrays, noise: Noise | None, plan: AnyPlan, prefix: Any = None) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
         executed: FloatArray = self._spec.chunk.executed(self._predict(obs, noise, plan, prefix))
         return executed
 
-    def _predict(self, obs: Mapping[str, Array], noise: Noise | None, plan: AnyPlan, prefix: Any) -> FloatArray:
+    def _predict(self, obs: Arrays, noise: Noise | None, plan: AnyPlan, prefix: Any) -> FloatArray:
         """One call; the actions ``[B, T, Da]``, which are finite."""
         self._report, wanted = None, self._plan(plan)
         spec = self._runtime.view(wanted).manifest.spec

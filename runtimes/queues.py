@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ttscompile.core.coercion import Array
+from ttscompile.core.coercion import Array, Arrays
 from ttscompile.core.spec import FloatArray, ObservationSpec
 from ttscompile.errors import ObservationError
 
@@ -31,7 +31,7 @@ class Queues:
         """A new episode."""
         self._frames, self._actions = {}, deque()
 
-    def after(self, frame: Mapping[str, Array]) -> Frames:
+    def after(self, frame: Arrays) -> Frames:
         """The frames with one more of every stream; the first of an episode fills the window. Nothing is kept yet.
 
         A call that fails after this, and is made again, must not push its frame twice: ``keep`` what it used when it
@@ -75,6 +75,6 @@ class Queues:
         return self._actions.popleft()
 
 
-def is_window(arrays: Mapping[str, Array], specs: Mapping[str, ObservationSpec]) -> bool:
+def is_window(arrays: Arrays, specs: Mapping[str, ObservationSpec]) -> bool:
     """Whether these are whole windows ``[B, To, ...]`` rather than one frame ``[B, ...]`` of each."""
     return all(arrays[key].ndim == len(spec.shape) + 1 for key, spec in specs.items() if spec.frames is not None)

@@ -1,13 +1,11 @@
 """Inputs for calls that stand for any other: to time them, or to hold two precisions against each other."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import Noise, PolicySpec
 
-Observation = dict[str, npt.NDArray[Any]]
+Observation = dict[str, Array]
 
 
 def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observation, Noise]]:

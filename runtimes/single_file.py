@@ -1,13 +1,12 @@
 """What a plan of an artifact wants as inputs of its single ONNX file; needs numpy alone."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
+from ttscompile.core.coercion import Array
 from ttscompile.core.envelope import plain_cells
 from ttscompile.core.lattice import dense_plan
 from ttscompile.core.plan import DENSE, FULL
@@ -18,7 +17,7 @@ from ttscompile.ir.pieces import USE_PRUNER
 from .liveness import readable_rollout
 
 
-def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> dict[str, npt.NDArray[Any]]:
+def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> dict[str, Array]:
     """The inputs of a single ONNX file for the first call of an episode with a plan, without observation and noise.
 
     Later calls of the episode are given ``rollout_rows`` and ``rollout_index`` as the call before left them.
@@ -54,7 +53,7 @@ def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> di
     view = view_of(artifact, own)
     blocks, steps = view.manifest.blocks, view.manifest.steps
     cells = dense_plan(steps, len(blocks)) if own.cells is None else own.cells
-    inputs: dict[str, npt.NDArray[Any]] = {"plan": cells[None], "rollout_keep": readable_rollout(view)}
+    inputs: dict[str, Array] = {"plan": cells[None], "rollout_keep": readable_rollout(view)}
     inputs["rollout_rows"] = np.zeros((0, *blocks[0].type.at(1)), np.float32)
     inputs["rollout_index"] = np.full((streams, steps, len(blocks)), -1, np.int64)
     if own.pruned:

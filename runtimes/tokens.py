@@ -5,7 +5,7 @@ held against these pixels, not against the frame before, so that slow changes ad
 a scene are its sequence: a token's own row is its patch.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -14,14 +14,14 @@ import numpy as np
 
 from ttscompile.artifact.manifest import MANIFEST, Manifest
 from ttscompile.artifact.strict_json import REMEDY
-from ttscompile.core.coercion import Array
+from ttscompile.core.coercion import Array, Arrays
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import INDEX, PIXELS, PLACES, ROWS, SCENE, pixels_name, tokens_name
 
-Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
+Run: TypeAlias = Callable[[str, Arrays], tuple[Array, ...]]
 """A piece, by its name, on inputs by theirs; its outputs in order."""
-Renew: TypeAlias = "Callable[[str, Mapping[str, Array], Kept], tuple[Array, ...]]"
+Renew: TypeAlias = "Callable[[str, Arrays, Kept], tuple[Array, ...]]"
 """A piece for some tokens, by its name, on inputs by theirs, and what is kept, whose rows it renews where they are; its
 other outputs in order."""
 
@@ -166,7 +166,7 @@ class TokenTower:
             computed, forward = np.isin(numbers, kept.index), np.isin(numbers, kept.forward)
             yield Seen(kept.pixels.copy(), computed, forward, self._record.patch, kept.number, kept.work)
 
-    def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], TokenWork]:
+    def compute(self, lane: Lane, row: Arrays) -> tuple[tuple[Array, ...], TokenWork]:
         """What the piece gives for a new frame, a row ``[1, ...]`` by its inputs, and what was done.
 
         What is kept of the lane is gone if this fails. It is of no use where something else is said: all tokens of a

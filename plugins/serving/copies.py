@@ -13,8 +13,8 @@ from uuid import uuid4
 
 import numpy as np
 
+from ttscompile.core.coercion import Array
 from ttscompile.errors import ArtifactChangedError, ClusterError, TtscompileError, first_line, needing
-from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.load import load
 
 from .fleet import Answered

@@ -16,11 +16,11 @@ import numpy as np
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import view_of
+from ttscompile.core.coercion import Array
 from ttscompile.core.tokenizer import TASK
 from ttscompile.core.values import fitted
 from ttscompile.errors import DeadlineMissedError, IllegalPlanError, ObservationError, OverloadedError
 from ttscompile.runtimes.arrays import image_remedy
-from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.instruct import Instruct
 from ttscompile.runtimes.liveness import reads_earlier_calls
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ttscompile.artifact.load import Artifact
+from ttscompile.core.coercion import Array
 from ttscompile.core.tokenizer import TASK
 from ttscompile.errors import ProtocolError
-from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.policy import CompiledPolicy
 
 from .admission import ServerLimits

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.core.tokenizer import TASK
 from ttscompile.core.untrusted_json import MAX_VALUES, most_values
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.statistics import COUNTS, ExecutorStatistics, Summary
-from ttscompile.runtimes.executor.window import Array
 
 Message = str | bytes
 Methods = Mapping[str, frozenset[str]]

@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ExecutorError
 from ttscompile.measure.timer import Timer, Times
@@ -78,7 +78,7 @@ def _require_prefix(policy: Policy, settings: Resolved, plan: str) -> None:
         raise ExecutorError(f"{needed}; {why} Use seam='blend' or seam='replace', or other plans.")
 
 
-def some_observation(specs: Mapping[str, ObservationSpec]) -> dict[str, npt.NDArray[Any]]:
+def some_observation(specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
     """An observation of one stream to measure with: random, and always the same. Zeros may be none: a mask, a token."""
     rng = np.random.default_rng(0)
     return {key: spec.draw(rng) for key, spec in specs.items()}

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import floor
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import FloatArray
 
 FOLLOW = 0.05
@@ -102,7 +102,7 @@ class Timeline:
         return replace(self, rows=rows, clipped=self.clipped | (rows != self.rows).any(axis=1))
 
     @property
-    def _arrays(self) -> tuple[npt.NDArray[Any], ...]:
+    def _arrays(self) -> tuple[Array, ...]:
         return self.rows, self.observed, self.chunks, self.clipped
 
     def at(self, tick: int) -> FloatArray | None:

@@ -14,14 +14,13 @@ from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import ChunkSpec, ObservationSpec
 from ttscompile.core.values import check_values
 from ttscompile.errors import ObservationError
 from ttscompile.runtimes.arrays import image_remedy, read_observation
 
-Array: TypeAlias = npt.NDArray[Any]
 Frame: TypeAlias = dict[str, Array]
 
 MOST_FRAMES = 1024

@@ -28,7 +28,7 @@ from ttscompile.artifact.files import read_file
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.artifact.tensors import MAPPED
 from ttscompile.artifact.view import View
-from ttscompile.core.coercion import Array
+from ttscompile.core.coercion import Array, Arrays
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir import pieces as kinds
@@ -237,7 +237,7 @@ class JointBlock:
     stream: TensorType
     blanks: dict[int, dict[str, Array]]
 
-    def feeds(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
+    def feeds(self, inputs: Arrays) -> dict[str, Array]:
         """The inputs of the joint session for the inputs of the block; those that it does not read are zeros."""
         assert self.piece.stream is not None
         stream, turns = inputs[self.piece.stream], self.joint.turns[self.index]
@@ -262,7 +262,7 @@ class Bound:
 
     __slots__ = ("_arrays", "_binding", "_session")
 
-    def __init__(self, session: Any, inputs: Mapping[str, Array], outputs: Mapping[str, Array]) -> None:
+    def __init__(self, session: Any, inputs: Arrays, outputs: Arrays) -> None:
         if isinstance(session, JointBlock):
             (residual,) = outputs.values()
             session, inputs, outputs = session.session, session.feeds(inputs), {kinds.RESIDUAL: residual}
@@ -281,7 +281,7 @@ class Bound:
             raise _failed(error) from error
 
 
-def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array]) -> dict[str, Array]:
+def run_named(session: Any, outputs: Sequence[str], inputs: Arrays) -> dict[str, Array]:
     """Run a session on arrays of the moment; its outputs by name."""
     try:
         return dict(zip(outputs, session.run(list(outputs), dict(inputs)), strict=True))
@@ -290,7 +290,7 @@ def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array])
 
 
 def run_piece(
-    sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], name: str, inputs: Mapping[str, Array]
+    sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], name: str, inputs: Arrays
 ) -> tuple[Array, ...]:
     """Run a piece on arrays of the moment, outputs in order: for ``frames``, which must not hold on to a backend."""
     return tuple(run_named(sessions[name], pieces[name].outputs, inputs).values())
@@ -300,7 +300,7 @@ _DTYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)
 """Of what a piece for some tokens gives, by onnxruntime's name."""
 
 
-def renew_piece(sessions: Mapping[str, Any], name: str, inputs: Mapping[str, Array], kept: Kept) -> tuple[Array, ...]:
+def renew_piece(sessions: Mapping[str, Any], name: str, inputs: Arrays, kept: Kept) -> tuple[Array, ...]:
     """Run a piece for some tokens: what is kept gets its new rows where it is. Its other outputs, in order.
 
     A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else. What is bound
@@ -335,7 +335,7 @@ def _failed(error: Exception) -> ArtifactError:
 
 
 def run_prologue(
-    sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], obs: Mapping[str, Array], contexts: ContextValues
+    sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], obs: Arrays, contexts: ContextValues
 ) -> None:
     """Keep what the normalised observations ``[B, ...]`` decide before the loop."""
     condition, step = pieces[kinds.CONDITION], pieces.get(kinds.STEP)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.artifact.view import View
+from ttscompile.core.coercion import Array, Arrays
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import Source, check_plan, require_legal
 from ttscompile.core.spec import Noise, PolicySpec
@@ -81,9 +82,9 @@ class ReferenceModel:
         spec: PolicySpec,
         types: Sequence[TensorType],
         groups: Sequence[int],
-        weights: Mapping[str, npt.NDArray[np.generic]],
+        weights: Arrays,
         device: torch.device | None = None,
-        first: Mapping[str, npt.NDArray[np.generic]] = MappingProxyType({}),
+        first: Arrays = MappingProxyType({}),
     ) -> None:
         self.device = torch.device("cpu") if device is None else device
         self._pieces, self._types, self.sampler = pieces, tuple(types), TorchSampler(spec.sampler)
@@ -285,7 +286,7 @@ def noise_tensors(noise: Noise, stochastic: bool) -> tuple[Tensor, Tensor | None
     return _tensor(noise.initial), steps
 
 
-def _tensor(array: npt.NDArray[np.generic]) -> Tensor:
+def _tensor(array: Array) -> Tensor:
     """A copy as a tensor: arrays of an artifact are read-only, and torch has no such tensors."""
     return torch.from_numpy(np.array(array))
 

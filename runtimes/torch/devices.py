@@ -6,10 +6,10 @@ from copy import copy
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import BF16, FP16, FP32
 from ttscompile.errors import RuntimeUnavailableError, first_line
 
@@ -98,7 +98,7 @@ class OnTensors:
         return other
 
 
-def placed(array: npt.NDArray[np.generic], device: torch.device) -> Tensor:
+def placed(array: Array, device: torch.device) -> Tensor:
     """A copy of an array as a tensor of a device."""
     return torch.from_numpy(np.array(array)).to(device)
 

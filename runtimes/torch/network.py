@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.artifact.view import View
-from ttscompile.core.coercion import Array
+from ttscompile.core.coercion import Array, Arrays
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
 from ttscompile.ir.pieces import BLOCKS, CONDITION, FRAMES, PRUNER, SCENE, STEM, STEP, TAIL, LoopPiece
@@ -27,7 +27,7 @@ class Placed:
         self.device = device
         self._known: dict[int, tuple[Array, Tensor]] = {}  # by identity, which the entry keeps from reuse
 
-    def all(self, arrays: Mapping[str, Array]) -> dict[str, Tensor]:
+    def all(self, arrays: Arrays) -> dict[str, Tensor]:
         """The tensors of these arrays, by name."""
         for array in arrays.values():
             if id(array) not in self._known:

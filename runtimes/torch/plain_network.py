@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
 from ttscompile.artifact.view import View
+from ttscompile.core.coercion import Arrays
 from ttscompile.core.correction import Correction
 from ttscompile.core.envelope import FAR, plain_cells
 from ttscompile.core.spec import Affine
@@ -158,9 +157,7 @@ class CallModule(nn.Module):
         idle: see ``loop.Network``, with the constants as they were.
     """
 
-    def __init__(
-        self, view: View, weights: Mapping[str, npt.NDArray[Any]], advance: Advance, correction: Correction | None
-    ) -> None:
+    def __init__(self, view: View, weights: Arrays, advance: Advance, correction: Correction | None) -> None:
         super().__init__()
         manifest, pieces = view.manifest, view.pieces
         self.spec, self.pieces, self._features = manifest.spec, pieces, manifest.features

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.lattice import BoolArray
 from ttscompile.runtimes.backend import Call, fill_initial, fill_offset, hold_known, stream_type
 from ttscompile.runtimes.instructions import Instructions
@@ -27,7 +26,7 @@ class Inlet:
         self._host = self.tensor
         if device.type != "cpu":
             self._host = torch.zeros(shape, dtype=self.tensor.dtype, pin_memory=device.type == "cuda")
-        self.array: npt.NDArray[Any] = self._host.numpy()
+        self.array: Array = self._host.numpy()
 
     def send(self) -> None:
         """Copy what was written."""

@@ -15,6 +15,7 @@ from torch.nn import functional
 from tests.families import cameras, scenes
 from tests.literal_tokens import LiteralTokens
 from ttscompile.capture.export import capture
+from ttscompile.core.coercion import Arrays
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.driver import transform
 from ttscompile.errors import PassError
@@ -22,7 +23,7 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.pieces import INDEX, PIXELS, PLACES, ROWS, kept_inputs
 from ttscompile.ir.program import Program
-from ttscompile.ir.tokens import TokenStream, Weights, find_sequence, find_tokens, words_of
+from ttscompile.ir.tokens import TokenStream, find_sequence, find_tokens, words_of
 from ttscompile.ir.verify import verify
 from ttscompile.passes.reuse_tokens import ReuseTokens, _pixels_graph, for_tokens
 from ttscompile.samplers.flow import flow_matching_table
@@ -232,7 +233,7 @@ class Told(nn.Module):
 
 
 @cache
-def sequence(change: str) -> tuple[Graph, Weights]:
+def sequence(change: str) -> tuple[Graph, Arrays]:
     """What stands for a scene: of what is read, all rows together."""
     torch.manual_seed(0)
     observations = {key: ObservationSpec((SEEN, WIDE), window=False) for key in ("rows", "other")}

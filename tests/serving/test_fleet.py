@@ -18,11 +18,11 @@ from tests.serving.serving import LIMITS, Client, ServerError, connected, listen
 from tests.serving.watching import figures, get
 from tests.word_tokenizer import write_tokenizer
 from ttscompile.artifact.load import load_artifact
+from ttscompile.core.coercion import Array
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.spec import Instruction, ObservationSpec
 from ttscompile.core.values import fitted
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
-from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.instruct import instruct_of
 from ttscompile.serving.fleet import Answered, FleetServer, Plans
 from ttscompile.serving.lock import Lock, hashed

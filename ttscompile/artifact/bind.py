@@ -6,11 +6,11 @@ from collections.abc import Collection, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.coercion import Array, Arrays
 from ..errors import ArtifactError
 from ..ir.pieces import LAYERS
 from . import tensors
@@ -38,7 +38,7 @@ REPORT = "This is an error in ttscompile; please report it."
 class Place:
     """The value of a constant, a file in the model's folder, and where it lies in that."""
 
-    value: npt.NDArray[Any]
+    value: Array
     file: str
     entry: tensors.Entry
 
@@ -54,11 +54,11 @@ class LoweredPieces:
 
     name: str
     models: Mapping[str, ModelProto]
-    weights: Mapping[str, npt.NDArray[Any]]
+    weights: Arrays
     asked: tuple[str, ...] = ()
 
 
-def places_of(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Place]:
+def places_of(path: Path, values: Arrays) -> dict[str, Place]:
     """Where these arrays lie in a safetensors file that holds them."""
     entries = tensors.entries_of(path)
     return {name: Place(value, path.name, entries[name]) for name, value in values.items()}
@@ -138,9 +138,7 @@ def interface(model: ModelProto) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return inputs, tuple(value.name for value in model.graph.output)
 
 
-def read_in_fp32(
-    constants: Mapping[str, npt.NDArray[Any]], models: Mapping[str, ModelProto], lowered: LoweredPieces
-) -> dict[str, npt.NDArray[Any]]:
+def read_in_fp32(constants: Arrays, models: Mapping[str, ModelProto], lowered: LoweredPieces) -> dict[str, Array]:
     """Those of a program's constants that no call reads in which all parts have the other precision; few are none.
 
     The piece ``layers`` does not count, which is for ``verify``.

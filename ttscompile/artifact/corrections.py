@@ -3,14 +3,13 @@
 Beside them stands what was recorded to fit them: ``envelope/FIELD``.
 """
 
-from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
 from itertools import chain
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.coercion import Array, Arrays
 from ..core.correction import Correction, groups_of
 from ..core.envelope import Envelope
 from ..errors import ArtifactError, IllegalPlanError
@@ -26,20 +25,20 @@ _OF_JUMPS, _OF_PREFIXES = ("inner", "middle", "outer"), ("prefixes",)
 _OF_ALL = tuple(one.name for one in fields(Correction) if one.default is one.default_factory is MISSING)
 
 
-def correction_arrays(plan: str, correction: Correction) -> dict[str, npt.NDArray[Any]]:
+def correction_arrays(plan: str, correction: Correction) -> dict[str, Array]:
     """The arrays of a plan's correction, by name."""
     names = (*_OF_ALL, *_OF_JUMPS * bool(correction.jumps), *_OF_PREFIXES * bool(correction.prefixes))
     own = {f"{PREFIX}{plan}/{name}": np.asarray(getattr(correction, name)) for name in names}
     return own if correction.late is None else own | correction_arrays(plan + LATE, correction.late)
 
 
-def envelope_arrays(envelope: Envelope | None) -> dict[str, npt.NDArray[Any]]:
+def envelope_arrays(envelope: Envelope | None) -> dict[str, Array]:
     """The arrays of an envelope, by name; none if there is none."""
     of = () if envelope is None else fields(Envelope)
     return {f"{ENVELOPE}{one.name}": getattr(envelope, one.name) for one in of}
 
 
-def read_envelope(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> Envelope | None:
+def read_envelope(stored: Arrays, manifest: Manifest, where: str) -> Envelope | None:
     """The envelope among some arrays; None if there is none."""
     parts = {name.removeprefix(ENVELOPE): array for name, array in stored.items() if name.startswith(ENVELOPE)}
     if not parts:
@@ -57,7 +56,7 @@ def read_envelope(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, wh
     return envelope
 
 
-def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> dict[str, Correction]:
+def read_corrections(stored: Arrays, manifest: Manifest, where: str) -> dict[str, Correction]:
     """The corrections among some arrays, by the name of the plan; arrays of other names are left alone."""
     parts = {name.removeprefix(PREFIX): array for name, array in stored.items() if name.startswith(PREFIX)}
     wanted = dict[str, tuple[str, ...]]()

@@ -12,11 +12,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.coercion import Array, Arrays
 from ..core.spec import ORIGINAL, FloatArray, Noise, PolicySpec
 from ..errors import ArtifactError
 from ..ir.graph import TensorType
@@ -27,8 +28,6 @@ from .strict_json import REMEDY
 
 if TYPE_CHECKING:
     from .load import Artifact
-
-Array = npt.NDArray[Any]
 
 DIGITS = 16
 """Random projections that are kept of an array, for each stream."""
@@ -68,8 +67,8 @@ class Golden:
         loops: by further loop, the record of a call in it; with the same observations, initial sample and scales.
     """
 
-    observations: Mapping[str, Array]
-    normalized: Mapping[str, Array]
+    observations: Arrays
+    normalized: Arrays
     initial: FloatArray
     draws: FloatArray | None
     steps: npt.NDArray[np.int64]
@@ -183,13 +182,11 @@ def _start(loop: str) -> str:
     return "" if loop == ORIGINAL else f"loop/{loop}/"
 
 
-def _length(arrays: Mapping[str, Array], name: str) -> int:
+def _length(arrays: Arrays, name: str) -> int:
     return len(arrays[name]) if name in arrays and arrays[name].ndim else 0
 
 
-def _wanted_of(
-    loop: str, manifest: Manifest, arrays: Mapping[str, Array], streams: int
-) -> dict[str, tuple[str, tuple[int, ...]]]:
+def _wanted_of(loop: str, manifest: Manifest, arrays: Arrays, streams: int) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Dtype and shape of every array that is of one loop, by its name."""
     spec, start = manifest.spec.in_loop(loop), _start(loop)
     anchors, evaluated = (_length(arrays, start + name) for name in ("steps", "evaluated"))

@@ -7,12 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..core.coercion import Errors
+from ..core.coercion import Arrays, Errors
 from ..core.envelope import Envelope
 from ..core.lattice import check_schedule, dense_plan
 from ..core.paths import require_path
@@ -60,13 +58,13 @@ class Artifact:
 
     path: Path
     manifest: Manifest
-    weights: Mapping[str, npt.NDArray[Any]]
-    tables: Mapping[str, npt.NDArray[Any]]
-    loop_tables: Mapping[str, Mapping[str, npt.NDArray[Any]]]
-    pruner: Mapping[str, npt.NDArray[Any]]
-    loop_pruners: Mapping[str, Mapping[str, npt.NDArray[Any]]]
+    weights: Arrays
+    tables: Arrays
+    loop_tables: Mapping[str, Arrays]
+    pruner: Arrays
+    loop_pruners: Mapping[str, Arrays]
     plans: Mapping[str, Plan]
-    block_weights: Mapping[str, Mapping[str, npt.NDArray[Any]]]
+    block_weights: Mapping[str, Arrays]
     envelope: Envelope | None
     _folder: Folder = field(repr=False)
     _stamps: Mapping[str, Stamp] = field(repr=False)
@@ -325,7 +323,7 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
     )
 
 
-def _optional(directory: Path, name: str | None) -> Mapping[str, npt.NDArray[Any]]:
+def _optional(directory: Path, name: str | None) -> Arrays:
     return MappingProxyType({}) if name is None else tensors.read(directory / name)
 
 
@@ -334,9 +332,7 @@ def table_prefix(loop: str) -> str:
     return TABLE_PREFIX if loop == ORIGINAL else f"{LOOP_PREFIX}{loop}/"
 
 
-def _tables(
-    stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, loop: str, where: Path
-) -> Mapping[str, npt.NDArray[Any]]:
+def _tables(stored: Arrays, manifest: Manifest, loop: str, where: Path) -> Arrays:
     prefix, steps = table_prefix(loop), manifest.sampler_of(loop).steps
     tables = {n.removeprefix(prefix): np.array(array) for n, array in stored.items() if n.startswith(prefix)}
     kinds = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}

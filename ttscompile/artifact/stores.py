@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.coercion import Array, Arrays
 from ..core.envelope import Envelope
 from ..core.plan import ORIGINAL, Plan
 from ..errors import ArtifactError
@@ -28,13 +28,11 @@ class BlockWeights:
         precision: what the artifact's other precision makes of them, by name; empty where it has none.
     """
 
-    weights: Mapping[str, npt.NDArray[Any]]
-    precision: Mapping[str, npt.NDArray[Any]]
+    weights: Arrays
+    precision: Arrays
 
 
-def plan_arrays_of(
-    manifest: Manifest, plans: Mapping[str, Plan], envelope: Envelope | None
-) -> dict[str, npt.NDArray[Any]]:
+def plan_arrays_of(manifest: Manifest, plans: Mapping[str, Plan], envelope: Envelope | None) -> dict[str, Array]:
     """Schedules and corrections of plans, and the envelope, by the names that they have in the file."""
     arrays = envelope_arrays(envelope)
     for name, record in manifest.plans.items():
@@ -47,7 +45,7 @@ def plan_arrays_of(
     return arrays
 
 
-def store_arrays(directory: Path, manifest: Manifest, store: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Manifest:
+def store_arrays(directory: Path, manifest: Manifest, store: str, arrays: Arrays) -> Manifest:
     """Write the file of a store beside the old one; without arrays there is none."""
     files = {name: record for name, record in manifest.files.items() if name != getattr(manifest.stores, store)}
     stores: dict[str, Any] = {store: None}
@@ -62,9 +60,7 @@ def pruner_name(piece: str, content: bytes) -> str:
     return f"{PRUNER}-{content_hash(content if piece == PRUNER else content + piece.encode())}"
 
 
-def store_pruner(
-    artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]], loop: str
-) -> Manifest:
+def store_pruner(artifact: Artifact, manifest: Manifest, weights: Arrays, loop: str) -> Manifest:
     """Write the weights of a loop's pruner, and its model that refers to them, beside the old ones."""
     own = artifact.pruner if loop == ORIGINAL else artifact.loop_pruners[loop]
     piece = PRUNER if loop == ORIGINAL else of_loop(PRUNER, loop)

@@ -16,16 +16,14 @@ from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.coercion import Array, Arrays
 from ..core.rules import MAX_RANK
 from ..core.untrusted_json import MAX_VALUES, most_values
 from ..errors import ArtifactChangedError, ArtifactError
 from .files import opened, write_synced
 from .short import SHORT, ShortArray, parts, short_code
 from .strict_json import REMEDY, Value, parse
-
-Array = npt.NDArray[Any]
 
 MAX_HEADER_BYTES = 64 * 2**20
 MAPPED = 2**23
@@ -114,7 +112,7 @@ def entries_of(path: Path) -> dict[str, Entry]:
         return _header(file, path, short=True)
 
 
-def read(path: Path, short: bool = False) -> Mapping[str, Array]:
+def read(path: Path, short: bool = False) -> Arrays:
     """Read a safetensors file, or map it into memory if it is large.
 
     Returns:
@@ -141,11 +139,7 @@ def read(path: Path, short: bool = False) -> Mapping[str, Array]:
 
 
 def check_arrays(
-    kind: str,
-    arrays: Mapping[str, Array],
-    wanted: Mapping[str, tuple[str, tuple[int, ...]]],
-    where: object,
-    remedy: str = REMEDY,
+    kind: str, arrays: Arrays, wanted: Mapping[str, tuple[str, tuple[int, ...]]], where: object, remedy: str = REMEDY
 ) -> None:
     """Raise ArtifactError unless these are exactly the arrays that are wanted, of the wanted dtypes and shapes."""
     found = {name: (str(array.dtype), array.shape) for name, array in arrays.items()}
@@ -157,17 +151,17 @@ def check_arrays(
         raise ArtifactError(f"{where}: expected the {kind} {wrong[0]!r} : {expected}; found {other}{count}. {remedy}")
 
 
-def serialize(arrays: Mapping[str, Array]) -> bytes:
+def serialize(arrays: Arrays) -> bytes:
     """The bytes of a safetensors file, the same whatever the order of the arrays."""
     return b"".join(_chunks(arrays))
 
 
-def write(path: Path, arrays: Mapping[str, Array], short: bool = False) -> None:
+def write(path: Path, arrays: Arrays, short: bool = False) -> None:
     """Write a new safetensors file, one array after the other: all of them together may be half of the memory."""
     write_synced(path, _chunks(arrays, short))
 
 
-def _chunks(arrays: Mapping[str, Array], short: bool = False) -> Iterator[bytes | memoryview]:
+def _chunks(arrays: Arrays, short: bool = False) -> Iterator[bytes | memoryview]:
     """A file in parts: its header, and each array. Their order is that of the safetensors library."""
     kinds = {dtype: code for code, dtype in _DTYPES.items()}
     arrays = {name: np.asarray(array) for name, array in arrays.items()}

@@ -19,8 +19,8 @@ from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.coercion import Array
 from ..core.rules import MAX_RANK, DType
 from ..errors import ArtifactError, SpecError
 from ..ir.graph import Batch, Size, TensorType
@@ -165,7 +165,7 @@ def _tensor_type(value: Value) -> TensorType:
     return TensorType(tuple(map(_size, parts["shape"].items(MAX_RANK))), read_as(DType, parts["dtype"]))
 
 
-def _array(value: Value) -> npt.NDArray[Any]:
+def _array(value: Value) -> Array:
     if isinstance(value.data, list):
         return _vector(value, "float32")
     members = value.keys("dtype", "shape", "values")
@@ -179,7 +179,7 @@ def _array(value: Value) -> npt.NDArray[Any]:
         members["shape"].fail("sizes that an array can have")
 
 
-def _vector(value: Value, dtype: str) -> npt.NDArray[Any]:
+def _vector(value: Value, dtype: str) -> Array:
     if dtype == "int64":
         return np.array([item.integer(None) for item in value.items()], np.int64)
     numbers = [item.number() for item in value.items()]

@@ -8,10 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
 
-import numpy.typing as npt
-
+from ..core.coercion import Arrays
 from ..core.correction import condition_flops, groups_of
 from ..core.lattice import PlanArray
 from ..core.plan import ORIGINAL, Plan, Variant
@@ -23,8 +21,6 @@ from ..ir.pieces import ADVANCE, PRUNER, SCENE, STEP, frame_pieces, of_loop, par
 from ..ir.program import Pieces
 from .load import Artifact
 from .manifest import Manifest, WeightsRecord
-
-Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy.typing as npt
-
+from ..core.coercion import Array, Arrays
 from ..core.envelope import Envelope
 from ..core.paths import require_free_or_path
 from ..core.plan import DENSE, FULL, ORIGINAL, Plan
@@ -130,7 +129,7 @@ def update_plans(
     default_plan: str,
     record: Mapping[str, Any] | None = None,
     *,
-    pruner_weights: Mapping[str, npt.NDArray[Any]] | None = None,
+    pruner_weights: Arrays | None = None,
     pruner_loop: str = ORIGINAL,
     weights: Mapping[str, stores.BlockWeights] | None = None,
     starts: Mapping[str, StartRecord] | None = None,
@@ -183,7 +182,7 @@ def update_plans(
                 directory, manifest, "plans", stores.plan_arrays_of(manifest, plans, envelope or artifact.envelope)
             )
             trained = {**artifact.block_weights, **{name: own.weights for name, own in (weights or {}).items()}}
-            pruners = dict[str, Mapping[str, npt.NDArray[Any]]]()
+            pruners = dict[str, Arrays]()
             if pruner_weights is not None:
                 own = pruner_loop if pruner_loop in manifest.loop_pruners else ORIGINAL
                 manifest = stores.store_pruner(artifact, manifest, pruner_weights, own)
@@ -261,7 +260,7 @@ def _fill(
     verify_pieces(program)
     graphs = program.pieces.graphs()
     read = sorted({name for graph in graphs.values() for name in graph.constants})
-    values: dict[str, npt.NDArray[Any]] = {name: program.weights[name] for name in read}
+    values: dict[str, Array] = {name: program.weights[name] for name in read}
     contexts, requires = records.context_records(program), records.requirements(models)
     # The names of loops need not be names of files.
     numbered = {of_loop(ADVANCE, of): f"{ADVANCE}_{i:02d}" for i, of in enumerate(program.spec.loops, start=1)}

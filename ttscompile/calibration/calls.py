@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..core.spec import PolicySpec
+from ..core.spec import FloatArray as FloatArray, PolicySpec
 from ..core.tokenizer import ReadTokenizer
 from ..errors import CalibrationError
 from ..measure.points import LARGEST
@@ -23,7 +23,6 @@ from ..trajectories.episodes import Episode, episodes_of
 from ..trajectories.fits import check_ranges
 
 IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float32]
 
 FRACTION = 0.25
 """Share of the episodes that plans are judged on where nothing else is asked for: who splits with the seed of a

@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
-import numpy.typing as npt
-
 from ..artifact.ceiling import FARTHEST
 from ..artifact.manifest import StartRecord, WeightsRecord
 from ..artifact.stores import BlockWeights
+from ..core.coercion import Arrays
 from ..core.plan import DENSE, FULL, Plan
 from ..errors import CalibrationFailedError
 from ..measure.points import SAME
@@ -51,7 +50,7 @@ class Kept:
         self.notes: dict[str, Mapping[str, Any]] = {}
         self.weights: dict[str, BlockWeights] = {}
         self.starts: dict[str, StartRecord] = {}
-        self.pruner: tuple[Mapping[str, npt.NDArray[Any]], str] | None = None
+        self.pruner: tuple[Arrays, str] | None = None
         self.refused: dict[str, str] = {}
         self.farther: dict[str, tuple[Plan, Score]] = {}
         self.told: dict[str, str] = {}

@@ -12,9 +12,8 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy.typing as npt
-
 from ..artifact.ceiling import BOUND, FARTHEST
+from ..core.coercion import Arrays
 from ..core.plan import Plan
 from ..errors import CalibrationError
 
@@ -69,7 +68,7 @@ class Proposal:
     name: str
     plan: Plan
     notes: Mapping[str, Any] = field(default_factory=dict)
-    pruner: Mapping[str, npt.NDArray[Any]] | None = None
+    pruner: Arrays | None = None
     weights: Mapping[str, BlockWeights] = field(default_factory=dict)
     starts: Mapping[str, StartRecord] = field(default_factory=dict)
     margin: float | None = None

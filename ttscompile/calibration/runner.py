@@ -9,10 +9,9 @@ all calls. Tests hold this against ``ReferenceModel.denoise``.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from ..artifact.view import View
+from ..core.coercion import Arrays
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, Source, dense_plan
 from ..errors import IllegalPlanError
@@ -110,7 +110,7 @@ class Runner:
         with torch.no_grad():
             return torch.stack(list(self.corrected(None)._following(self._dense, calls)), 1)
 
-    def logits(self, calls: Calls, weights: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
+    def logits(self, calls: Calls, weights: Arrays) -> npt.NDArray[np.float32]:
         """What the pruner says with these constants, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.from_numpy(np.array(value)) for name, value in weights.items()}
         with torch.no_grad():

@@ -12,7 +12,7 @@ import numpy as np
 from ..artifact import tensors
 from ..artifact.files import replace_file
 from ..artifact.strict_json import Value
-from ..core.coercion import Array
+from ..core.coercion import Array, Arrays
 from ..core.untrusted_json import parse_json
 from ..errors import ArtifactError, CalibrationError
 
@@ -116,7 +116,7 @@ class StateFile:
                 " --resume: that begins anew."
             ) from error
 
-    def put(self, prefix: str, arrays: Mapping[str, Array]) -> None:
+    def put(self, prefix: str, arrays: Arrays) -> None:
         """Replace all arrays below a prefix."""
         self.arrays = {name: array for name, array in self.arrays.items() if not name.startswith(f"{prefix}/")}
         self.arrays.update({f"{prefix}/{name}": array for name, array in arrays.items()})
@@ -126,7 +126,7 @@ class StateFile:
         return {n.removeprefix(f"{prefix}/"): a for n, a in self.arrays.items() if n.startswith(f"{prefix}/")}
 
 
-def _checksum(arrays: Mapping[str, Array]) -> bytes:
+def _checksum(arrays: Arrays) -> bytes:
     """The sha256 of names, types and contents, whatever their order."""
     digest = hashlib.sha256()
     for name in sorted(arrays):

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.coercion import Array as Array, Arrays
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..errors import CalibrationError
@@ -19,8 +19,6 @@ from .calls import Actions, Calls
 from .clock import Clock
 from .runner import Runner
 from .whole_steps import WholeSteps
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Found:
     schedule: PlanArray
     notes: Mapping[str, Any] = field(default_factory=dict)
     correction: Correction | None = None
-    pruner: Mapping[str, Array] | None = None
+    pruner: Arrays | None = None
     pruner_correction: Correction | None = None
     error: float = math.nan
 
@@ -61,7 +59,7 @@ class Task:
     calls: Calls
     budget: int
     seed: int
-    pruner: Mapping[str, Array]
+    pruner: Arrays
     whole: WholeSteps
     clock: Clock = field(default_factory=Clock)
 
@@ -144,7 +142,7 @@ class Search(Protocol):
     def state(self) -> dict[str, Array]:
         """Everything that ``restore`` needs."""
 
-    def restore(self, state: Mapping[str, Array]) -> None:
+    def restore(self, state: Arrays) -> None:
         """Go back to where ``state`` was taken. Raises KeyError: not the state of this search."""
 
     def found(self) -> Found:

@@ -8,13 +8,12 @@ crowded schedules. Where there are few others, it tries them all; else it moves 
 at first, until no move helps. The winner's correction is fitted again, on all calls.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 
+from ..core.coercion import Array, Arrays
 from ..core.lattice import PlanArray
 from .step_counts import other_placements, spacings
-from .task import Array, Found, Task
+from .task import Found, Task
 
 MOVED_BY = (8, 4, 2, 1)
 """How far a step is moved, in either direction. All steps are tried at one distance before the next."""
@@ -70,7 +69,7 @@ class Tts:
             "settled": np.array(int(self._found is not None)),
         }
 
-    def restore(self, state: Mapping[str, Array]) -> None:
+    def restore(self, state: Arrays) -> None:
         """Go back to where ``state`` was taken."""
         self._steps, self.loss = tuple(int(k) for k in state["steps"]), float(state["loss"])
         if state["settled"]:

@@ -12,13 +12,13 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch._subclasses import FakeTensor
 from torch.export import _trace, exported_program as decompose
 from torch.export.graph_signature import InputKind, OutputKind
 
+from ..core.coercion import Array
 from ..core.spec import PolicySpec
 from ..errors import CaptureError
 from ..frontends.encoded import sharing_copy
@@ -31,7 +31,7 @@ _RESHAPE = "aten.reshape.default"
 _VIEWS = (torch.ops.aten.view.default, torch.ops.aten._unsafe_view.default)
 _SPLITS = (torch.ops.aten.split.Tensor, torch.ops.aten.split_with_sizes.default)
 
-Weights = dict[str, npt.NDArray[np.generic]]
+Weights = dict[str, Array]
 
 
 def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:

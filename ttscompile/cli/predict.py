@@ -9,12 +9,12 @@ from typing import Any
 
 import click
 import numpy as np
-import numpy.typing as npt
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import artifact_argument, json_option, seed_option
 from ttscompile.cli.output import print_identity, print_json, progress, results, say
 from ttscompile.cli.types import FILE, PATH, PICTURE, TEXT
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import ObservationSpec, PolicySpec
 from ttscompile.errors import ObservationError, needing
 from ttscompile.plots.figure import write_picture
@@ -118,9 +118,6 @@ def predict(
     if picture is not None:
         write_picture(plot_chunk(chunk, executed, told), picture)
         say(progress(), f"wrote {picture}")
-
-
-Array = npt.NDArray[Any]
 
 
 def observed(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ObservationError, SpecError
-from .coercion import Array, integer, numbers
+from .coercion import Arrays, integer, numbers
 from .poses import NUMBERS, Pose, composed, has_rotation
 from .rules import OMITTED
 from .sampler import FloatArray
@@ -199,7 +198,7 @@ class ChunkSpec:
         """The executed part ``[..., Ta, Da]`` of denoised samples ``[..., T, D]``, or of actions ``[..., T, Da]``."""
         return samples[..., self.start : self.stop, : self.action_dim]
 
-    def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:
+    def reference(self, obs: Arrays) -> FloatArray | None:
         """What actions of a call with these observations, as given, are relative to, ``[B, 1, Da]``; None for nothing.
 
         There are zeros where actions are not relative. Raises ObservationError: a measured pose has no rotation.

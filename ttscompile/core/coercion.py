@@ -7,6 +7,7 @@ tensors are known without importing torch.
 
 import operator
 import sys
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,6 +16,8 @@ import numpy.typing as npt
 from ..errors import TtscompileError
 
 Array: TypeAlias = npt.NDArray[Any]
+Arrays: TypeAlias = Mapping[str, Array]
+"""By name."""
 Errors: TypeAlias = type[TtscompileError]
 
 

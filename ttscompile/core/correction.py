@@ -25,13 +25,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import IllegalPlanError
-from .coercion import integer
+from .coercion import Array, integer
 from .spec import FloatArray
 
 FEATURES = 6
@@ -87,13 +86,13 @@ class Correction:
     """
 
     anchors: npt.NDArray[np.bool_]
-    weights: npt.NDArray[np.float32]
-    bias: npt.NDArray[np.float32]
-    reading: npt.NDArray[np.float32]
-    observed: npt.NDArray[np.float32]
-    inner: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
-    middle: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
-    outer: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
+    weights: FloatArray
+    bias: FloatArray
+    reading: FloatArray
+    observed: FloatArray
+    inner: FloatArray = field(default_factory=_no_jumps)
+    middle: FloatArray = field(default_factory=_no_jumps)
+    outer: FloatArray = field(default_factory=_no_jumps)
     prefixes: int = field(default=0, kw_only=True)
     late: "Correction | None" = field(default=None, kw_only=True)
 
@@ -171,7 +170,7 @@ class Correction:
                 f" {found[1]} action dimensions; this policy has {numbers} such numbers and {sample[1]} dimensions."
             )
 
-    def inputs(self) -> dict[str, npt.NDArray[Any]]:
+    def inputs(self) -> dict[str, Array]:
         """Its arrays by the names of the inputs of a single ONNX file (``lower.single_file``)."""
         named = {ANCHORS: self.anchors, CORRECTION: self.weights, CORRECTION_BIAS: self.bias}
         if self.reads:

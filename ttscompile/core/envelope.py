@@ -10,12 +10,11 @@ In units of the deviation of each component that is Mahalanobis' distance, over 
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import IllegalPlanError
+from .coercion import Array
 from .correction import Correction
 from .lattice import PlanArray, uniform_plan
 from .spec import FloatArray
@@ -39,8 +38,8 @@ class Envelope:
         IllegalPlanError: other shapes or dtypes, or numbers that are not finite.
     """
 
-    reading: npt.NDArray[np.float32]
-    center: npt.NDArray[np.float32]
+    reading: FloatArray
+    center: FloatArray
 
     def __post_init__(self) -> None:
         arrays = self.reading, self.center
@@ -54,7 +53,7 @@ class Envelope:
         """Of conditions ``[B, N]``, float32 ``[B]``; not above 1 for those that were recorded."""
         return np.asarray(np.linalg.norm(condition @ self.reading - self.center, axis=1), np.float32)
 
-    def inputs(self, plain_cells: PlanArray) -> dict[str, npt.NDArray[Any]]:
+    def inputs(self, plain_cells: PlanArray) -> dict[str, Array]:
         """Of a single ONNX file, with the cells of a call that is far outside, int8 ``[K, blocks]``."""
         return {ENVELOPE: self.reading, CENTER: self.center, PLAIN: plain_cells}
 

@@ -9,14 +9,14 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
 from .chunk import LARGEST as LARGEST, Affine as Affine, ChunkSpec as ChunkSpec, Relative as Relative, Switch as Switch
-from .coercion import Array, integer
+from .coercion import Array, Arrays, integer
 from .pictures import in_bytes
 from .rules import LOOP_NAME, OMITTED, DType, LoopName, Positive, Shape
 from .sampler import FloatArray as FloatArray, SamplerTable as SamplerTable
@@ -134,11 +134,11 @@ class ObservationSpec:
         drawn = in_bytes(drawn) if self.fit == "stretch" else drawn
         return drawn.astype(self.dtype)
 
-    def draw_normalized(self, rng: np.random.Generator, streams: int) -> npt.NDArray[Any]:
+    def draw_normalized(self, rng: np.random.Generator, streams: int) -> Array:
         """Random observations ``[streams, *shape]`` as the network is given them."""
         return self.normalized(np.concatenate([self.draw(rng) for _ in range(streams)]))
 
-    def normalized(self, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def normalized(self, array: Array) -> Array:
         """What the network is given of observations ``[..., *shape]``; the array itself without a normaliser."""
         return array if self.normalizer is None else self.normalizer.normalize(array)
 
@@ -249,11 +249,11 @@ class PolicySpec:
         count = ObservationSpec((1,), dtype="int64", window=False, bounds=(0, self.trained_prefix))
         return {**self.observations, COMMITTED: count} if self.trained_prefix else self.observations
 
-    def committed(self, streams: int, count: int = 0) -> dict[str, npt.NDArray[Any]]:
+    def committed(self, streams: int, count: int = 0) -> dict[str, Array]:
         """What a network that was trained with prefixes reads of one of so many actions; of all others nothing."""
         return {COMMITTED: np.full((streams, 1), count)} if self.trained_prefix else {}
 
-    def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:
+    def reference(self, obs: Arrays) -> FloatArray | None:
         """``ChunkSpec.reference`` of observations as the network is given them."""
         if (relative := self.chunk.relative) is None:
             return None

@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.fx.config
 
 from ttscompile.errors import CaptureError, ObservationError
 
+from ..core.coercion import Arrays
 from .graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from .operations import find_operation, operation
 
@@ -88,7 +88,7 @@ def evaluate(
     return Evaluator(graph, weights)(inputs)
 
 
-def evaluator(graph: Graph, weights: Mapping[str, npt.NDArray[Any]]) -> Evaluator:
+def evaluator(graph: Graph, weights: Arrays) -> Evaluator:
     """The graph with its weights, which are read where they are: also where nobody may write, as in an artifact.
 
     Torch warns of such an array because somebody could write to its tensor. A graph writes to none of its constants.

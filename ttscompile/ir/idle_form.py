@@ -19,21 +19,19 @@ Where the tail is affine itself, y is [0, 1] and the rest of the above: predicti
 the whole network (``passes.one_block``) A H is zero, and the prediction is the total's.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from ..core.coercion import Arrays
 from .evaluate import evaluate
 from .graph import Batch, Graph, Node, Ref, TensorType, backward_slice
 from .operations import Linear, operation
 from .program import Pieces
 
 Wide = npt.NDArray[np.float64]
-Weights = Mapping[str, npt.NDArray[np.generic]]
-
 _NORM = "aten.layer_norm.default"
 
 
@@ -74,7 +72,7 @@ class _Affine:
     constant: Wide  # [T, m]
 
 
-def idle_form(pieces: Pieces, weights: Weights) -> tuple[IdleForm | None, str]:
+def idle_form(pieces: Pieces, weights: Arrays) -> tuple[IdleForm | None, str]:
     """The form of a program with these pieces and values of constants, or None and why it has another."""
     try:
         with torch.inference_mode(False), torch.enable_grad():  # whatever the caller's mode
@@ -83,7 +81,7 @@ def idle_form(pieces: Pieces, weights: Weights) -> tuple[IdleForm | None, str]:
         return None, str(reason)
 
 
-def _form(pieces: Pieces, weights: Weights) -> IdleForm:
+def _form(pieces: Pieces, weights: Arrays) -> IdleForm:
     if pieces.stem.contexts or pieces.tail.contexts:
         raise _Declined("stem or tail read values of the observation or the step")
     sample, kind = pieces.stem.type, pieces.tail.type
@@ -110,7 +108,7 @@ def _form(pieces: Pieces, weights: Weights) -> IdleForm:
     return IdleForm(kind, turned, stem.constant, basis, eps, head.matrix, product, head.constant.T[:, None])
 
 
-def _affine(graph: Graph, weights: Weights, turned_in: bool = False, turned_out: bool = False) -> _Affine:
+def _affine(graph: Graph, weights: Arrays, turned_in: bool = False, turned_out: bool = False) -> _Affine:
     """What an affine graph in float64 does to every token of its one input; what is turned has its tokens first.
 
     Its operations say that it is affine; that all tokens meet the same matrix, and no token another, is tried on random
@@ -168,7 +166,7 @@ def _split_at_norm(tail: Graph, stream: str) -> tuple[Node, Graph]:
     return norm, backward_slice(tail, tail.outputs, {norm.name: norm.type})
 
 
-def _norm_arguments(norm: Node, weights: Weights, width: int) -> tuple[Wide, Wide, float]:
+def _norm_arguments(norm: Node, weights: Arrays, width: int) -> tuple[Wide, Wide, float]:
     """Scale ``[W]``, shift ``[W]`` and epsilon."""
     eps = norm.argument(4, 1e-5)
     if norm.argument(1) != (width,) or norm.kwargs or not isinstance(eps, float):

@@ -7,9 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar, cast
 
-import numpy as np
-import numpy.typing as npt
-
+from ..core.coercion import Arrays
 from ..core.spec import PolicySpec
 from .graph import Graph, TensorType
 from .pieces import CONDITION, FRAMES, PRUNER, SCENE, STEM, STEP, TAIL, LoopPiece, block_name, frame_name
@@ -106,14 +104,14 @@ class Pieces(Loop):
     condition: Graph
     step: Graph | None = None
     pruner: Graph | None = None
-    tables: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    tables: Arrays = field(default_factory=dict)
     bindings: Mapping[str, Binding] = field(default_factory=dict)
     features: tuple[str, ...] = ()
     frames: Graph | None = None
     towers: tuple[Graph, ...] = ()
     scene: Graph | None = None
     tokens: Mapping[str, Graph] = field(default_factory=dict)
-    loop_tables: Mapping[str, Mapping[str, npt.NDArray[Any]]] = field(default_factory=dict)
+    loop_tables: Mapping[str, Arrays] = field(default_factory=dict)
     loop_pruners: Mapping[str, Graph] = field(default_factory=dict)
 
     @property
@@ -190,7 +188,7 @@ class Phase:
 
     spec: PolicySpec
     denoiser: Graph
-    weights: Mapping[str, npt.NDArray[np.generic]]
+    weights: Arrays
     dense_flops: int = field(default=0, kw_only=True)
     once_flops: int = field(default=0, kw_only=True)
     unmoved: PolicySpec | None = field(default=None, kw_only=True)
@@ -242,7 +240,7 @@ class Program(Phase):
 
     blocks: tuple[Block, ...]
     pieces: Pieces
-    loop_weights: Mapping[str, Mapping[str, npt.NDArray[np.generic]]] = field(default_factory=dict)
+    loop_weights: Mapping[str, Arrays] = field(default_factory=dict)
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from ..core.coercion import Arrays
 from .dataflow import reachable_from
 from .evaluate import drawn, evaluator
 from .flops import graph_flops, node_flops
@@ -20,8 +20,6 @@ MOST_WHOLE = 0.25
 ATTENTION = "aten.scaled_dot_product_attention.default"
 _CONVOLUTION, _CAT = "aten.conv2d.default", "aten.cat.default"
 _PRODUCTS = ("aten.matmul.default", "aten.bmm.default")
-
-Weights = Mapping[str, npt.NDArray[np.generic]]
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class TokenStream:
     axes: Mapping[str, int]
 
 
-def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
+def find_tokens(tower: Graph, weights: Arrays) -> TokenStream | str:
     """The tokens of a tower; or why and where it is none that reads a picture patch by patch."""
     types, observed = tower.types(), reachable_from(tower, tower.inputs)
     patches = [n for n in tower.nodes if n.name in observed and n.op.startswith("aten.conv")]
@@ -113,7 +111,7 @@ def find_sequence(scene: Graph) -> TokenStream | str:
     return told
 
 
-def words_of(sequence: Graph, weights: Weights) -> tuple[int, ...]:
+def words_of(sequence: Graph, weights: Arrays) -> tuple[int, ...]:
     """The rows of what a graph gives, ``[B, 1, T, D]``, that no picture changes; found on numbers."""
     run, rng = evaluator(sequence, weights), np.random.default_rng(0)
     given = {name: drawn(type_, 1, rng) for name, type_ in sequence.inputs.items()}
@@ -160,7 +158,7 @@ def _entry(tower: Graph, patches: str) -> str | None:
     return left[0] if len(left) == 1 and not free & set(tower.outputs) else None
 
 
-def _patches_of(tower: Graph, pixels: str, entry: str, weights: Weights) -> list[int]:
+def _patches_of(tower: Graph, pixels: str, entry: str, weights: Arrays) -> list[int]:
     """Of each row of ``entry`` the number of the one patch that changes it; -1 of none, -2 of several or half a row."""
     types = tower.types()
     graph = backward_slice(tower, (entry,), {pixels: types[pixels]})

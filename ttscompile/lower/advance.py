@@ -13,13 +13,14 @@ from dataclasses import replace
 import numpy as np
 from onnx import ModelProto, helper
 
+from ..core.coercion import Arrays
 from ..core.correction import HISTORY, groups_of
 from ..core.spec import PolicySpec
 from ..core.update import clip_of, columns, rows
 from ..errors import LoweringError
 from ..ir import pieces as names
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, copied
-from ..ir.idle_form import IdleForm, Weights, Wide, idle_form
+from ..ir.idle_form import IdleForm, Wide, idle_form
 from ..ir.pieces import BASE, IDLE, PRODUCT, SHIFT, TOTAL
 from ..ir.program import Pieces, Program
 from .graph_writer import GraphWriter, tensor
@@ -139,7 +140,7 @@ def _fresh(name: str, taken: set[str]) -> str:
     return name
 
 
-def lower_idle(pieces: Pieces, weights: Weights, opset: int) -> tuple[ModelProto | None, str]:
+def lower_idle(pieces: Pieces, weights: Arrays, opset: int) -> tuple[ModelProto | None, str]:
     """The model of a program with these pieces and values of constants, or None and why there is none."""
     form, why = idle_form(pieces, weights)
     return (None if form is None else _write(form, opset)), why

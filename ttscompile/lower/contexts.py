@@ -5,11 +5,12 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto
 
+from ..core.coercion import Arrays
 from ..errors import LoweringError
 from ..ir.graph import TensorType
 from ..ir.pieces import PRUNER, STEP
 from ..ir.program import Binding, Pieces, once_values
-from .graph_writer import GraphWriter, Weights
+from .graph_writer import GraphWriter
 
 
 class Contexts:
@@ -31,7 +32,7 @@ class Contexts:
         main: GraphWriter,
         pieces: Pieces,
         models: Mapping[str, ModelProto],
-        weights: Weights,
+        weights: Arrays,
         observations: Mapping[str, str],
         streams: str,
         steps: int,

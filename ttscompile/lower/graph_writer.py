@@ -10,10 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
 
+from ..core.coercion import Array, Arrays
 from ..errors import LoweringError
-
-Array = npt.NDArray[Any]
-Weights = Mapping[str, npt.NDArray[Any]]
 
 
 class GraphWriter:
@@ -68,7 +66,7 @@ class GraphWriter:
         """An If; the names of its outputs."""
         return self.ops("If", [condition], len(then.output), then_branch=then, else_branch=otherwise)
 
-    def inline(self, model: ModelProto, inputs: Mapping[str, str], weights: Weights) -> list[str]:
+    def inline(self, model: ModelProto, inputs: Mapping[str, str], weights: Arrays) -> list[str]:
         """Lay a model inside this graph, its weights too: onnxruntime packs only weights of the graph that reads them.
 
         ``inputs`` has a value for each of its inputs, and for constants that are no weights here. The outputs' names.
@@ -89,7 +87,7 @@ class GraphWriter:
             self.nodes.append(copy)
         return [names[value.name] for value in graph.output]
 
-    def _weight(self, tensor: TensorProto, weights: Weights) -> str:
+    def _weight(self, tensor: TensorProto, weights: Arrays) -> str:
         if tensor.raw_data or 0 in tensor.dims:
             made = numpy_helper.to_array(tensor)
             return self.constant(made, made.dtype)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import ModelProto, NodeProto, TensorProto, numpy_helper, shape_inference
 
-from ..core.coercion import Array
+from ..core.coercion import Array, Arrays
 from .graph_writer import GraphWriter
 from .onnx_model import replaced
 
@@ -78,7 +78,7 @@ def integer_convolution(
     w: GraphWriter,
     node: NodeProto,
     attributes: Mapping[str, Any],
-    known: Mapping[str, Array],
+    known: Arrays,
     shapes: Mapping[str, Sequence[int]],
     store: Callable[[str, Array], tuple[str, str]],
 ) -> bool:

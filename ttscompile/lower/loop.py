@@ -20,11 +20,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import GraphProto, ModelProto
 
+from ..core.coercion import Arrays
 from ..core.correction import INNER, MIDDLE, OUTER
 from ..ir import pieces as names
 from ..ir.program import Program
 from .contexts import StreamContexts
-from .graph_writer import GraphWriter, Weights, sequence, tensor
+from .graph_writer import GraphWriter, sequence, tensor
 from .plan import LoweredPlan
 
 GROUP = 6
@@ -99,7 +100,7 @@ class DenoisingLoop:
         main: GraphWriter,
         program: Program,
         models: Mapping[str, ModelProto],
-        weights: Weights,
+        weights: Arrays,
         contexts: StreamContexts,
     ) -> None:
         self._main, self._models, self._weights, self._contexts = main, models, weights, contexts

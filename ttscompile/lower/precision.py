@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from ..core.coercion import Array
+from ..core.coercion import Array, Arrays
 from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, columns_at_once, pack
 from ..core.spec import FP32, INT4, INT8, PRECISIONS
 from ..errors import LoweringError
@@ -102,7 +102,7 @@ def parts_to_lower(
 
 
 def lower_precision(
-    models: Mapping[str, ModelProto], weights: Mapping[str, Array], precision: str, parts: Collection[str] = (BLOCKS,)
+    models: Mapping[str, ModelProto], weights: Arrays, precision: str, parts: Collection[str] = (BLOCKS,)
 ) -> tuple[dict[str, ModelProto], dict[str, Array], tuple[str, ...]]:
     """The models of some parts again, with weights of another precision.
 
@@ -150,7 +150,7 @@ def lower_precision(
 
 
 def _notes(
-    precision: str, part: str, pieces: list[str], lowered: Mapping[str, ModelProto], constants: Mapping[str, Array]
+    precision: str, part: str, pieces: list[str], lowered: Mapping[str, ModelProto], constants: Arrays
 ) -> Iterator[str]:
     kinds = Counter(node.op_type for model in lowered.values() for node in model.graph.node)
     if lowered:
@@ -180,7 +180,7 @@ def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
 
 def quantize_model(
     model: ModelProto,
-    weights: Mapping[str, Array],
+    weights: Arrays,
     least_rows: int = 0,
     size: int = 1,
     precision: str = INT8,
@@ -241,7 +241,7 @@ def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np
     return integers, scale
 
 
-def _matrices(model: ModelProto, known: Mapping[str, Array]) -> Matrices:
+def _matrices(model: ModelProto, known: Arrays) -> Matrices:
     """The constants by the names of their values, and what transpositions and reshapes make of them."""
     shapes = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer if t.raw_data or t.int64_data}
     found = {name: (name, value) for name, value in known.items() if value.dtype == np.float32}
@@ -260,7 +260,7 @@ def _matrices(model: ModelProto, known: Mapping[str, Array]) -> Matrices:
 def _integer_product(
     w: GraphWriter,
     node: NodeProto,
-    known: Mapping[str, Array],
+    known: Arrays,
     matrices: Matrices,
     shapes: Mapping[str, Sequence[int]],
     enough: Callable[[str, int], bool],
@@ -294,11 +294,7 @@ def _integer_product(
 
 
 def _integer_rows(
-    w: GraphWriter,
-    node: NodeProto,
-    attributes: Mapping[str, Any],
-    known: Mapping[str, Array],
-    store: Callable[..., tuple[str, str]],
+    w: GraphWriter, node: NodeProto, attributes: Mapping[str, Any], known: Arrays, store: Callable[..., tuple[str, str]]
 ) -> bool:
     """Write the rows that are read of a large constant table, an embedding, with integers; whether it is one."""
     table = known.get(node.input[0]) if node.op_type == "Gather" else None

@@ -15,6 +15,7 @@ import numpy as np
 from onnx import ModelProto, ValueInfoProto, helper
 
 from ..core import correction
+from ..core.coercion import Arrays
 from ..core.envelope import CENTER, ENVELOPE, FAR, PLAIN
 from ..core.lattice import Source
 from ..core.spec import ORIGINAL, PolicySpec, Relative
@@ -24,7 +25,7 @@ from ..ir.graph import Graph
 from ..ir.pieces import ADVANCE, PRUNER, USE_PRUNER, of_loop
 from ..ir.program import Program
 from .contexts import Contexts
-from .graph_writer import GraphWriter, Weights, tensor
+from .graph_writer import GraphWriter, tensor
 from .loop import LoopInputs
 from .onnx_model import opsets, own_model
 from .plan import ExecutedPlans, write_executed_plans
@@ -36,7 +37,7 @@ LARGEST = 2**31 - 1
 
 
 def lower_single_file(
-    program: Program, models: Mapping[str, ModelProto], weights: Weights, loop: str = ORIGINAL
+    program: Program, models: Mapping[str, ModelProto], weights: Arrays, loop: str = ORIGINAL
 ) -> ModelProto:
     """The model of the whole call in one of the program's loops, with its weights inside; blocks may be in int8.
 
@@ -222,7 +223,7 @@ def _write_cache(main: GraphWriter, plans: ExecutedPlans, stored: str, new_rows:
 Values = list[ValueInfoProto]
 
 
-def write_interface(main: GraphWriter, program: Program, weights: Weights) -> tuple[Values, Values]:
+def write_interface(main: GraphWriter, program: Program, weights: Arrays) -> tuple[Values, Values]:
     """All inputs, those that may be left out with what they are then; and all outputs."""
     spec, pieces = program.spec, program.pieces
     observations = [tensor(key, each.dtype, ["B", *each.shape]) for key, each in spec.observations.items()]
@@ -273,7 +274,7 @@ def _of_every_policy(program: Program) -> tuple[Values, Values]:
     return inputs, outputs
 
 
-def _of_pruner(main: GraphWriter, head: Graph, weights: Weights) -> Values:
+def _of_pruner(main: GraphWriter, head: Graph, weights: Arrays) -> Values:
     """Whether the pruner makes the plan, and its weights: by default it does not, and they are those of the program."""
     constants = {name: np.asarray(weights[name], type_.dtype) for name, type_ in head.constants.items()}
     return [main.default(name, value) for name, value in {USE_PRUNER: np.array(False), **constants}.items()]

@@ -15,9 +15,10 @@ from dataclasses import replace
 import numpy as np
 from onnx import ModelProto, TensorProto
 
+from ..core.coercion import Arrays
 from ..ir.program import Program
 from .contexts import Contexts, StreamContexts
-from .graph_writer import GraphWriter, Weights, sequence, tensor
+from .graph_writer import GraphWriter, sequence, tensor
 from .loop import GROUP, DenoisingLoop, LoopInputs
 from .plan import INT64, ExecutedPlans, lower_plan
 
@@ -26,7 +27,7 @@ def write_streams(
     main: GraphWriter,
     program: Program,
     models: Mapping[str, ModelProto],
-    weights: Weights,
+    weights: Arrays,
     contexts: Contexts,
     plans: ExecutedPlans,
     inputs: LoopInputs,

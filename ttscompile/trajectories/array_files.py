@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from ..core.coercion import Array
 from ..errors import TrajectoryError
-from .frames import AS_NPZ, Array, Recording, blocks, bytes_of, one_error, require_files, require_proportion
+from .frames import AS_NPZ, Recording, blocks, bytes_of, one_error, require_files, require_proportion
 
 CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
 """Compression that only computes. zarr also knows codecs that unpickle what they read."""

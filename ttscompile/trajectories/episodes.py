@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..core.coercion import integer
+from ..core.coercion import Array, Arrays, integer
 from ..core.paths import on_hub, require_path
 from ..core.spec import Instruction, ObservationSpec, PolicySpec
 from ..core.tokenizer import TASK, ReadTokenizer, Tokenizer
@@ -31,8 +30,6 @@ from ..hub import fetch_recording
 from ..hub.repository import MOST_EPISODES
 from .frames import Frames, few, frames_of_calls, instruction_rows, observation_frames, one_error, require_proportion
 from .sandbox import sandboxed_frames
-
-Array = npt.NDArray[Any]
 
 ENDS, META = "episode_ends", "meta"
 MAX_META = 2**20
@@ -49,7 +46,7 @@ class Episode:
     """
 
     name: str
-    observations: Mapping[str, Array]
+    observations: Arrays
 
     @property
     def calls(self) -> int:

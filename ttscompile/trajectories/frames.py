@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.coercion import Array, Arrays
 from ..core.spec import Instruction, ObservationSpec
 from ..core.tokenizer import TASK, ReadTokenizer, padded
 from ..errors import TrajectoryError
-
-Array = npt.NDArray[Any]
 
 MAX_RATIO, FREE_BYTES = 200, 256 * 2**20
 """Arrays may take so many times the bytes of their file, or this much; what takes more is a bomb. Deflate reaches 1000
@@ -212,7 +210,7 @@ def instruction_rows(
     instruction: Instruction,
     observations: Mapping[str, ObservationSpec],
     tokenizer: ReadTokenizer,
-    others: Mapping[str, Array],
+    others: Arrays,
 ) -> dict[str, Array]:
     """Tokens and mask of every row, from its text.
 

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from ..core.coercion import Array
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .frames import Array, Recording, one_error, require_files, require_proportion
+from .frames import Recording, one_error, require_files, require_proportion
 
 EPISODE, FRAME, TIME, TASKS = "episode_index", "frame_index", "timestamp", "task_index"
 MAX_INFO = 64 * 2**20

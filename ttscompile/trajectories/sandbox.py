@@ -21,10 +21,11 @@ from typing import IO, Any, BinaryIO
 
 import numpy as np
 
+from ..core.coercion import Array
 from ..core.limits import limit
 from ..errors import TrajectoryError
 from .array_files import hdf5_recording, zarr_recording
-from .frames import AS_NPZ, BLOCK_BYTES, Array, Frames, Recording, bytes_of, one_error, require_proportion, worth_of
+from .frames import AS_NPZ, BLOCK_BYTES, Frames, Recording, bytes_of, one_error, require_proportion, worth_of
 from .lerobot_dataset import lerobot_recording
 
 MORE_BYTES, MORE_SECONDS = 2**30, 4

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from ..artifact.golden import Golden, GoldenPlan, is_sparse, project
 from ..artifact.load import Artifact
 from ..artifact.view import view_of
-from ..core.lattice import PlanArray, Source, dense_plan
+from ..core.coercion import Array, Arrays
+from ..core.lattice import BoolArray, PlanArray, Source, dense_plan
 from ..core.plan import DENSE, ORIGINAL, Plan
 from ..core.spec import Noise
 from ..core.update import bounded
@@ -95,7 +96,7 @@ def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung
     return judged(RUNTIMES, error, SAMPLE, VALUE, told, remedy, step=step, blocks=wrong)
 
 
-def _reference_blocks(reference: Any, obs: Mapping[str, npt.NDArray[Any]]) -> Any:
+def _reference_blocks(reference: Any, obs: Arrays) -> Any:
     import torch
 
     with torch.no_grad():
@@ -111,7 +112,7 @@ def _reference_blocks(reference: Any, obs: Mapping[str, npt.NDArray[Any]]) -> An
 
 def check_plans(
     artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime
-) -> tuple[Rung, dict[str, npt.NDArray[np.bool_]]]:
+) -> tuple[Rung, dict[str, BoolArray]]:
     """Episodes of two sparse calls with each plan, in fp32, against what calibration stored.
 
     Also, by plan, the cells ``[K, blocks]`` that differ, where some do.
@@ -123,7 +124,7 @@ def check_plans(
         told = f"no record of {', '.join(plans)}: they were written by other means than 'ttscompile calibrate'"
         return Rung(PLANS, SKIPPED, told, remedy="Calibrate the artifact to have its plans verified."), {}
     failures: list[tuple[str, int | None, tuple[int, ...]]] = []
-    cells, worst = dict[str, npt.NDArray[np.bool_]](), 0.0
+    cells, worst = dict[str, BoolArray](), 0.0
     for name, record in recorded.items():
         plan = artifact.plans[name].exact
         made, differ, few, error = replay(artifact, golden, runtime, plan, record)
@@ -156,7 +157,7 @@ def check_plans(
 
 def replay(
     artifact: Artifact, golden: Golden, runtime: Runtime, plan: Plan, record: GoldenPlan
-) -> tuple[PlanArray, npt.NDArray[np.bool_], bool, float]:
+) -> tuple[PlanArray, BoolArray, bool, float]:
     """The episode that ``GoldenPlan`` describes.
 
     Returns:
@@ -167,7 +168,7 @@ def replay(
     loop = plan.loop if start is None else start.loop
     own, obs = golden.in_loop(loop), golden.network_observations(spec)
 
-    def episode(plans: Iterable[Plan]) -> tuple[PlanArray, npt.NDArray[Any]]:
+    def episode(plans: Iterable[Plan]) -> tuple[PlanArray, Array]:
         made, samples = [], []
         runtime.reset()
         if start is not None:  # the chunk before the first call is that of the original

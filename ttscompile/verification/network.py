@@ -5,9 +5,8 @@ inside. It is slow and plain on purpose: where a call goes wrong and this goes r
 runtime that puts them together is not.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +15,7 @@ from ..artifact.golden import Golden, probe_stream, project
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
 from ..artifact.view import View
+from ..core.coercion import Array, Arrays
 from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
@@ -26,13 +26,11 @@ from ..runtimes.frames import FramePieces
 from ..runtimes.onnxruntime.sessions import Sessions, run_named, run_piece, run_prologue
 from .rung import ErrorMap, Rung, finite, judged
 
-Array = npt.NDArray[Any]
-
 
 class Probe:
     """The pieces on one observation, normalised, ``[B, ...]`` by key."""
 
-    def __init__(self, view: View, obs: Mapping[str, Array]) -> None:
+    def __init__(self, view: View, obs: Arrays) -> None:
         self._view, self._manifest, self._pool = view, view.manifest, Sessions(1)
         self._sessions = self._pool.of(view)
         self.streams = len(next(iter(obs.values())))
@@ -168,14 +166,14 @@ BlockFunction = Callable[[int, int, FloatArray], FloatArray]
 CONVERT = "Convert the checkpoint again; if that does not help, please report it."
 
 
-def relative(found: npt.NDArray[Any], expected: npt.NDArray[Any]) -> float:
+def relative(found: Array, expected: Array) -> float:
     """Size of the difference of two arrays as a share of the second's size."""
     difference = np.linalg.norm(found.astype(np.float64) - expected)
     size = float(np.linalg.norm(expected.astype(np.float64)))
     return float(difference) / max(size, 1e-30)
 
 
-def largest(found: npt.NDArray[Any], expected: npt.NDArray[Any]) -> float:
+def largest(found: Array, expected: Array) -> float:
     """Largest difference as a share of the largest expected value; 0 for equal arrays, infinity for NaN."""
     difference = float(np.max(np.abs(found.astype(np.float64) - expected), initial=0.0))
     if not np.isfinite(difference):

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from ..artifact import tensors
 from ..artifact.golden import Golden, GoldenPlan
 from ..artifact.load import Artifact
+from ..core.coercion import Array, Arrays
 from ..core.four_bits import BLOCK, further_off
 from ..core.spec import INT4, INT8
 from ..errors import ArtifactError
@@ -112,7 +112,7 @@ def _steps_off(artifact: Artifact) -> Iterator[tuple[float, str]]:
             yield from _apart(artifact, record.precision_weights, {**artifact.weights, **artifact.block_weights[name]})
 
 
-def _apart(artifact: Artifact, file: str, weights: Mapping[str, npt.NDArray[Any]]) -> Iterator[tuple[float, str]]:
+def _apart(artifact: Artifact, file: str, weights: Arrays) -> Iterator[tuple[float, str]]:
     with artifact.reading(file):
         stored = tensors.read(artifact.files / file)
         for name, integers in stored.items():
@@ -127,20 +127,20 @@ def _apart(artifact: Artifact, file: str, weights: Mapping[str, npt.NDArray[Any]
             yield (_off_in_four if four else _off)(integers, scale, weight), constant
 
 
-def _packs(integers: npt.NDArray[Any], weight: npt.NDArray[Any]) -> bool:
+def _packs(integers: Array, weight: Array) -> bool:
     """Whether packed integers may be of a matrix, or of the same turned."""
     sizes = integers.shape[1], len(integers)
     shapes = (weight.shape, weight.shape[::-1])
     return weight.ndim == 2 and any((math.ceil(rows / BLOCK), columns) == sizes for rows, columns in shapes)
 
 
-def _off_in_four(integers: npt.NDArray[Any], scale: npt.NDArray[np.float32], weight: npt.NDArray[Any]) -> float:
+def _off_in_four(integers: Array, scale: npt.NDArray[np.float32], weight: Array) -> float:
     """The largest difference of a block from a matrix, or the same turned, where half a step is plain rounding's."""
     turned = [one for one in (weight, weight.T) if one.shape[1] == len(integers)]
     return min(further_off(integers, scale, one) / 2 for one in turned if math.ceil(len(one) / BLOCK) == len(scale.T))
 
 
-def _off(integers: npt.NDArray[Any], scale: npt.NDArray[np.float32], weight: npt.NDArray[Any]) -> float:
+def _off(integers: Array, scale: npt.NDArray[np.float32], weight: Array) -> float:
     """The largest difference of integers ``[rows, columns]`` from a constant that they were made of, in steps.
 
     Some axes of the constant are the columns, and the numbers of a column may have another order there: they are

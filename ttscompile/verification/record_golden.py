@@ -15,6 +15,7 @@ from torch import nn
 from ..artifact.golden import DIGITS, Golden, GoldenPlan, expand, is_sparse, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
+from ..core.coercion import Array, Arrays
 from ..core.plan import Plan
 from ..core.spec import ORIGINAL, FloatArray, Noise, PolicySpec
 from ..errors import CaptureError
@@ -166,9 +167,7 @@ def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
     return {name: found[name] for name in plans}
 
 
-def _episode(
-    view: View, model: ReferenceModel, plan: Plan, golden: Golden, obs: Mapping[str, npt.NDArray[Any]]
-) -> GoldenPlan:
+def _episode(view: View, model: ReferenceModel, plan: Plan, golden: Golden, obs: Arrays) -> GoldenPlan:
     cache, calls, chunk = model.empty_cache(golden.streams), [], golden.sample
     for order in (1, -1):
         contexts = model.prologue({key: torch.from_numpy(value[::order].copy()) for key, value in obs.items()})
@@ -212,7 +211,7 @@ class _Inside:
             streams = evaluator(self._closed, self._weights)(inputs)
         return np.array([max(float(stream.std()), 1e-3) for stream in streams], np.float32)
 
-    def alone(self, timesteps: npt.NDArray[Any], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def alone(self, timesteps: Array, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What each block, and each layer, gives on ``probe_stream`` at these A timesteps.
 
         Projections of residuals ``[A, blocks, B, DIGITS]``, and of layers ``[A, L, DIGITS]``.

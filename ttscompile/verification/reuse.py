@@ -10,12 +10,12 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..artifact.ceiling import uncalibrated
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
 from ..artifact.manifest import PlanRecord
+from ..core.coercion import Arrays
 from ..core.lattice import sparsity
 from ..core.plan import DENSE, FULL, UNIFORM
 from ..core.spec import Noise
@@ -68,7 +68,7 @@ def check_episodes(artifact: Artifact, policy: CompiledPolicy, episodes: Sequenc
     spec, draw = manifest.spec, np.random.default_rng(0)
     name = manifest.default_plan if manifest.default_plan in manifest.plans else next(iter(manifest.plans))
 
-    def executed(plan: str, rows: Sequence[Mapping[str, npt.NDArray[Any]]], noises: Sequence[Noise]) -> Any:
+    def executed(plan: str, rows: Sequence[Arrays], noises: Sequence[Noise]) -> Any:
         """What a plan answers to the calls of an episode, normalised, ``[R, A]``."""
         policy.reset()
         made = [policy.predict_action(o, noise=n, plan=plan)["action"] for o, n in zip(rows, noises, strict=True)]

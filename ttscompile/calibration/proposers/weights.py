@@ -23,7 +23,7 @@ from ...artifact.bind import unbound
 from ...artifact.load import Artifact
 from ...artifact.stores import BlockWeights
 from ...artifact.view import view_of
-from ...core.coercion import Array
+from ...core.coercion import Array, Arrays
 from ...core.lattice import Source, whole_steps_plan
 from ...core.plan import ORIGINAL, Plan
 from ...errors import CalibrationError, CalibrationFailedError
@@ -158,7 +158,7 @@ class Student:
             arrays |= {f"{key}/{name}": moments[key].cpu().numpy() for key in ("exp_avg", "exp_avg_sq")}
         return arrays
 
-    def restore(self, arrays: Mapping[str, Array], done: int) -> None:
+    def restore(self, arrays: Arrays, done: int) -> None:
         """Go on after so many updates."""
         for name, factor in self._factors.items():
             factor.copy_(torch.from_numpy(arrays[f"factor/{name}"]))

@@ -19,12 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...core.coercion import Array, Arrays
 from ...core.lattice import PlanArray, Source, whole_steps_plan
 from ...ir.plan_head import NAMES, first_numbers, has_head
 from ...runtimes.plans import pruner_plan
 from ..calls import Calls, IntArray, calls_of
 from ..step_counts import spacings
-from ..task import Array, Found, NothingAfter, Task
+from ..task import Found, NothingAfter, Task
 from .straight_through import Practice, legal, written
 
 UPDATES = 240
@@ -143,7 +144,7 @@ class Paper(NothingAfter):
             state[f"size/{name}"] = np.array(self._size[name])
         return state
 
-    def restore(self, state: Mapping[str, Array]) -> None:
+    def restore(self, state: Arrays) -> None:
         """Go back to where ``state`` was taken."""
         self.plan = np.array(state["plan"], np.int8)
         self.loss, self._interval = float(state["loss"]), int(state["interval"])
@@ -189,7 +190,7 @@ class Paper(NothingAfter):
             base[..., source] = FORBIDDEN
         return base.astype(np.float32)
 
-    def _logits(self, values: Mapping[str, Array] | Mapping[str, Tensor], calls: Calls) -> Tensor:
+    def _logits(self, values: Arrays | Mapping[str, Tensor], calls: Calls) -> Tensor:
         """What the head says, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.as_tensor(value) for name, value in values.items()}
         if self._observes:
@@ -275,7 +276,7 @@ def _price(logits: Array, cells: int) -> float:
     return float(ordered[0]) + 1 if count <= 0 else float(ordered[count - 1] + ordered[count]) / 2
 
 
-def _first_numbers(head: Mapping[str, Array]) -> dict[str, Array]:
+def _first_numbers(head: Arrays) -> dict[str, Array]:
     """What the observation goes through, as it was before any calibration: an artifact has what the last one left."""
     (width, inputs), rank = head["pruner.hidden.weight"].shape, head["pruner.step"].shape[1]
     first = first_numbers(inputs, width, rank, *head[BASE].shape[:2])
