@@ -44,9 +44,9 @@ def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> di
         problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact is of loop {loop!r}"
         raise IllegalPlanError(f"{problem}. Give a plan of that loop, or use ttscompile.load.")
     record = artifact.manifest.precision
-    bits, computed = (FP32, FP32) if record is None else (record.name, record.told)
+    bits, computed = artifact.manifest.precision_name, FP32 if record is None else record.told
     # The file computes in the precision of ``convert``, and all tokens, whatever a plan says.
-    if own.tokens is not None or own.precision != ({} if record is None else dict.fromkeys(record.kept, bits)):
+    if own.tokens is not None or own.precision != artifact.manifest.held:
         problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact has all tokens, {computed}"
         remedy = f"Give {name.partition('@')[0] + '@' + bits!r}, or use ttscompile.load."
         raise IllegalPlanError(f"{problem}. {remedy}")

@@ -20,7 +20,9 @@ WITH, WITHOUT = jumping(FIVE), no_correction(5, (4, 2))
 def of_plans(*names: str) -> Any:
     """What a manifest says of a policy of five steps, with plans of these names."""
     plans, spec = {name: PlanRecord("all") for name in names}, SimpleNamespace(sample=(4, 2))
-    return SimpleNamespace(plans=plans, starts={}, steps_of=lambda loop: 5, spec=spec, condition_numbers=7)
+    return SimpleNamespace(
+        plans=plans, whole_loop=lambda loop: loop, steps_of=lambda loop: 5, spec=spec, condition_numbers=7
+    )
 
 
 def test_what_is_stored_is_read_again() -> None:

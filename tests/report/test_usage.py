@@ -18,7 +18,7 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.cli import main
 from ttscompile.core.lattice import dense_plan, uniform_plan
-from ttscompile.core.plan import Plan
+from ttscompile.core.plan import ORIGINAL, Plan
 from ttscompile.ir.plan_head import first_numbers
 from ttscompile.report.usage import BRANCH, CONTEXTS, HEAD, TABLE, told_unused, usage_table, uses
 from ttscompile.runtimes.liveness import sources_of_pruner
@@ -92,7 +92,7 @@ def test_a_pruner_uses_what_it_can_choose(own: Artifact) -> None:
 def test_the_sources_that_a_head_of_ours_can_choose(own: Artifact) -> None:
     """As it is put in it is dense; one number more, and one cell can be FORWARD; and at -1 nothing else changes."""
     head = first_numbers(4, 8, 2, 5, 5)
-    made = view_of(replace(own, pruner=head), Plan(cells=None))  # only its numbers are read
+    made = view_of(replace(own, pruners={ORIGINAL: head}), Plan(cells=None))  # only its numbers are read
     assert sources_of_pruner(made)[..., 0].all()
     assert not sources_of_pruner(made)[..., 1:].any()
     head["pruner.base"][2, 3, 1] = 4.0

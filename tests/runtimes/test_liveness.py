@@ -11,7 +11,7 @@ from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
-from ttscompile.core.plan import Plan
+from ttscompile.core.plan import ORIGINAL, Plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.liveness import readable_rollout, reads_earlier_calls, rollout_needs
@@ -70,7 +70,7 @@ def test_a_pruner_is_known_by_the_bounds_of_its_logits(
     store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {})
     artifact = load_artifact(own_artifact.path)
     assert readable_rollout(view_of(artifact)).all()  # the toy's own pruner is of another form
-    changed = replace(artifact, pruner=head(**changes))
+    changed = replace(artifact, pruners={ORIGINAL: head(**changes)})
     assert np.argwhere(readable_rollout(view_of(changed))).tolist() == cells
     view = view_of(changed)
     assert {name for name, plan in view.plans.items() if reads_earlier_calls(view, plan)} == (

@@ -101,7 +101,7 @@ def _extract(archive: zipfile.ZipFile, path: Path, folder: Path) -> None:
     for name, record in manifest.files.items():
         if name in entries:
             _copy(archive, entries[name], record.bytes, path, folder / name)
-        elif manifest.precision is None or name != manifest.precision.fp32:
+        elif name != manifest.apart:
             raise ArtifactError(f"{path}: the file {name} is missing; {MANIFEST} lists it. {_AGAIN}")
 
 

@@ -101,8 +101,7 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     document, own = to_json(manifest), (names.PRUNER, names.of_loop(names.PRUNER, ""))
     pieces, stores = document["pieces"], {k: v for k, v in document["stores"].items() if k not in _GOLDEN}
     of_model = {name: piece for name, piece in pieces.items() if name != own[0] and not name.startswith(own[1])}
-    apart = [] if manifest.precision is None or manifest.precision.fp32 is None else [manifest.precision.fp32]
-    read = {stores["program"], stores["weights"], *apart, *(piece["file"] for piece in of_model.values())}
+    read = {stores["program"], stores["weights"], manifest.apart, *(piece["file"] for piece in of_model.values())}
     hashes = {name: record.sha256 for name, record in sorted(manifest.acting.items())}
     model_identity = _checksum(
         {
@@ -152,10 +151,8 @@ def plan_fault(manifest: Manifest, plan: PlanRecord) -> str | None:
         return f"a loop, one of {list(manifest.loops)}"
     if plan.weights not in (ORIGINAL, *manifest.weights):
         return f"weights, one of {[ORIGINAL, *manifest.weights]}"
-    record = manifest.precision
-    held = {} if record is None else dict.fromkeys(record.kept, record.name)
-    if not plan.precision.items() <= held.items():
-        return f"parts in the precision that the artifact has models in, {held or 'none'}"
+    if not plan.precision.items() <= manifest.held.items():
+        return f"parts in the precision that the artifact has models in, {manifest.held or 'none'}"
     if plan.tokens is not None and not manifest.tokens:
         return "no reuse of tokens, because no frame piece has tokens"
     if plan.tokens is not None and plan.tokens.scene is not None and names.SCENE not in manifest.tokens:
@@ -165,8 +162,8 @@ def plan_fault(manifest: Manifest, plan: PlanRecord) -> str | None:
     other = manifest.plans.get(plan.otherwise or DENSE)
     if plan.otherwise not in (None, DENSE) and (other is None or other.loop in manifest.starts):
         return "a plan for calls without a chunk whose loop begins with noise"
-    loop = manifest.starts[plan.loop].loop if plan.loop in manifest.starts else None
-    if loop is not None and loop != (ORIGINAL if other is None else other.loop):
+    loop = manifest.whole_loop(plan.loop)
+    if loop != plan.loop and loop != (ORIGINAL if other is None else other.loop):
         return f"a plan for calls without a chunk in loop {loop!r}, whose last steps these are"
     return None
 

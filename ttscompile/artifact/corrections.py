@@ -84,6 +84,5 @@ def read_corrections(stored: Arrays, manifest: Manifest, where: str) -> dict[str
 
 def require_fit(correction: Correction, manifest: Manifest, loop: str) -> None:
     """Raise IllegalPlanError unless it is a correction for this loop of a policy."""
-    start, sample = manifest.starts.get(loop), manifest.spec.sample
-    whole = manifest.steps_of(loop if start is None else start.loop)
+    sample, whole = manifest.spec.sample, manifest.steps_of(manifest.whole_loop(loop))
     correction.require_fit(manifest.steps_of(loop), sample, manifest.condition_numbers, groups_of(whole, sample))

@@ -46,10 +46,9 @@ class Artifact:
         path: the directory; of a zipped artifact a temporary one, which lives as long as this object.
         manifest: what is not array or graph.
         weights: constants of all pieces but the pruner's, read-only; views of a large file.
-        tables: TABLE contexts ``[K, ...]`` of the original loop, which are read and never mapped.
-        loop_tables: the same of the other loops that begin with noise, by their name.
-        pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
-        loop_pruners: the same of loops that have a pruner of their own, by their name.
+        loop_tables: by loop that begins with noise, its TABLE contexts ``[K, ...]``, which are read and never mapped.
+        pruners: by loop that has a pruner of its own, the constants of that (their names start with ``pruner.``). All
+            other loops have the original's, which has no constants if there is no pruner.
         plans: by name, ``dense`` the first of them.
         block_weights: by the name of weights that plans may have, the constants that blocks have in place of those of
             ``weights``; read-only, views of large files.
@@ -59,10 +58,8 @@ class Artifact:
     path: Path
     manifest: Manifest
     weights: Arrays
-    tables: Arrays
     loop_tables: Mapping[str, Arrays]
-    pruner: Arrays
-    loop_pruners: Mapping[str, Arrays]
+    pruners: Mapping[str, Arrays]
     plans: Mapping[str, Plan]
     block_weights: Mapping[str, Arrays]
     envelope: Envelope | None
@@ -72,10 +69,19 @@ class Artifact:
     _derived: dict[str, Plan] = field(default_factory=dict, repr=False)
 
     @property
+    def tables(self) -> Arrays:
+        """TABLE contexts of the original loop."""
+        return self.loop_tables[ORIGINAL]
+
+    @property
+    def pruner(self) -> Arrays:
+        """Constants of the original loop's pruner."""
+        return self.pruners[ORIGINAL]
+
+    @property
     def without(self) -> str | None:
         """Name of the file of what is read in fp32 alone, where this copy lacks it; None for a whole artifact."""
-        record = self.manifest.precision
-        return None if record is None or record.fp32 in (None, *self._stamps) else record.fp32
+        return None if self.manifest.apart in self._stamps else self.manifest.apart
 
     @property
     def bytes(self) -> int:
@@ -153,10 +159,9 @@ class Artifact:
         if not precision:
             return self.plans[own]
         if name not in self._derived:
-            record, plan = self.manifest.precision, self.plans[own].exact
-            held = names.parts_of(self.manifest.pieces)
+            plan, held = self.plans[own].exact, names.parts_of(self.manifest.pieces)
             if precision in (INT8, INT4):  # without any, what is missing is told when it is opened
-                held = (names.BLOCKS,) if record is None else record.kept
+                held = tuple(self.manifest.held) or (names.BLOCKS,)
             plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(parts or held, precision))
             first = self.plans[own].otherwise
             otherwise = None if first is None else self.plan(f"{self.name_of(first)}@{rest}")
@@ -180,7 +185,7 @@ class Artifact:
     @cached_property
     def graphs(self) -> Mapping[str, Graph]:
         """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``."""
-        graphs, own = {}, {names.of_loop(names.PRUNER, loop): one for loop, one in self.loop_pruners.items()}
+        graphs, own = {}, {names.of_loop(names.PRUNER, loop): one for loop, one in self.pruners.items()}
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             graphs[name] = graph_from_json(value)
             constants, stored = graphs[name].constants, own.get(name, {**self.pruner, **self.weights})
@@ -280,8 +285,7 @@ def _load_directory(path: Path, shown: Path) -> Artifact:
 
 def present(manifest: Manifest, directory: Path) -> list[str]:
     """The files that have to be there: all but what is read in fp32 alone, where it is not."""
-    apart = None if manifest.precision is None else manifest.precision.fp32
-    return [name for name in manifest.files if name != apart or os.path.lexists(directory / name)]
+    return [name for name in manifest.files if name != manifest.apart or os.path.lexists(directory / name)]
 
 
 def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Manifest) -> Artifact:
@@ -297,24 +301,21 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
     others = sorted(stamps.keys() - manifest.models - {stores.program, stores.tokenizer, MANIFEST})
     tensors.require_few((directory / name for name in others), directory)
     stored = tensors.read(directory / manifest.stores.weights, short=True)
-    apart = None if manifest.precision is None else manifest.precision.fp32
-    if apart in stamps:
-        stored = MappingProxyType({**stored, **tensors.read(directory / str(apart), short=True)})
+    if manifest.apart in stamps:
+        stored = MappingProxyType({**stored, **tensors.read(directory / str(manifest.apart), short=True)})
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}
     for name, record in manifest.weights.items():
         block_weights[name] = own = tensors.read(directory / record.weights)
         of_weights = {n: (str(stored[n].dtype), stored[n].shape) for n in own if n in stored}
-        known = own if apart in (None, *stamps) else {n: own[n] for n in of_weights}
+        known = own if manifest.apart in (None, *stamps) else {n: own[n] for n in of_weights}
         tensors.check_arrays(f"{name} weight", known, of_weights, directory)
     return Artifact(
         path=path,
         manifest=manifest,
         weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith((TABLE_PREFIX, LOOP_PREFIX))}),
-        tables=tables.pop(ORIGINAL),
         loop_tables=MappingProxyType(tables),
-        pruner=_optional(directory, manifest.stores.pruner),
-        loop_pruners={loop: tensors.read(directory / file) for loop, file in manifest.loop_pruners.items()},
+        pruners={loop: _optional(directory, file) for loop, file in manifest.pruner_files.items()},
         plans=_plans(directory, manifest),
         block_weights=MappingProxyType(block_weights),
         envelope=read_envelope(_optional(directory, manifest.stores.plans), manifest, str(directory)),

@@ -4,9 +4,8 @@ Frozen records; ``codec`` writes and reads them. ``docs/design.md`` section 5.
 """
 
 import re
-from collections.abc import Mapping, Sized
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Annotated, Any, Literal
 
 from ..core.correction import Correction, numbers_of
@@ -22,12 +21,6 @@ from .towers import TokensRecord
 FORMAT = "ttscompile artifact"
 SCHEMA_VERSION = 12
 MANIFEST = "manifest.json"
-_SHOWN = 12
-
-
-def _at_most(most: int, them: Sized) -> bool:
-    return len(them) <= most
-
 
 FileName = Annotated[
     str,
@@ -39,7 +32,8 @@ FileName = Annotated[
 PLAN_NAME = Rule("letters, digits and _ . % -", re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}").fullmatch)
 PlanName = Annotated[str, PLAN_NAME]
 Version = Annotated[str, Rule("a version like 1.23", re.compile(r"[0-9]{1,9}(\.[0-9]{1,9}){0,9}").fullmatch)]
-FEW, MANY = (Rule(f"at most {most} entries", partial(_at_most, most)) for most in (256, 4096))
+FEW = Rule("at most 256 entries", lambda them: len(them) <= 256)
+MANY = Rule("at most 4096 entries", lambda them: len(them) <= 4096)
 """Of what each is held against the others, and of what there is one a block or a piece. Push-T has 24 blocks."""
 OfContext = Annotated[
     Binding, Rule("table, condition or step", (Binding.TABLE, Binding.CONDITION, Binding.STEP).__contains__)
@@ -114,12 +108,9 @@ class FlopsRecord:
     blocks: tuple[int, ...]
 
     def call(self, plan: PlanArray, pruned: bool, correction: Correction | None = None) -> float:
-        """FLOPs of one call of one stream.
+        """FLOPs of one call of one stream with a plan, int8 ``[K, blocks]``, and its correction, whose jumps count.
 
-        Args:
-            plan: int8 ``[K, blocks]``.
-            pruned: whether the pruner ran to make it.
-            correction: of the plan; its jumps are counted.
+        ``pruned`` says whether the pruner ran to make the plan.
         """
         fixed = 0 if correction is None else correction.flops_of_jumps
         fixed += self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
@@ -333,6 +324,25 @@ class Manifest:
         """The precision that some parts have models of beside fp32; ``fp32`` where none has."""
         return FP32 if self.precision is None else self.precision.name
 
+    @property
+    def held(self) -> dict[str, str]:
+        """By part, the precision beside fp32 that there are models of."""
+        return {} if self.precision is None else dict.fromkeys(self.precision.kept, self.precision.name)
+
+    @property
+    def apart(self) -> str | None:
+        """Name of the file with what is read in fp32 alone; None where nothing stands apart."""
+        return None if self.precision is None else self.precision.fp32
+
+    @property
+    def pruner_files(self) -> dict[str, str | None]:
+        """By loop that has a pruner of its own, the file with its constants; None for the original if it has none."""
+        return {ORIGINAL: self.stores.pruner, **self.loop_pruners}
+
+    def whole_loop(self, loop: str) -> str:
+        """The loop whose last steps this one is, where it begins with a chunk; itself where it begins with noise."""
+        return self.starts[loop].loop if loop in self.starts else loop
+
     def steps_of(self, loop: str) -> int:
         """K of a loop, whatever it begins with."""
         start = self.starts.get(loop)
@@ -381,7 +391,7 @@ class Manifest:
 
 def abbreviated(identity: str) -> str:
     """The first 12 digits of an identity, for people; JSON has all 64."""
-    return identity[:_SHOWN]
+    return identity[:12]
 
 
 def marked(plan: str) -> str:

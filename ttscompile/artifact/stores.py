@@ -62,12 +62,10 @@ def pruner_name(piece: str, content: bytes) -> str:
 
 def store_pruner(artifact: Artifact, manifest: Manifest, weights: Arrays, loop: str) -> Manifest:
     """Write the weights of a loop's pruner, and its model that refers to them, beside the old ones."""
-    own = artifact.pruner if loop == ORIGINAL else artifact.loop_pruners[loop]
     piece = PRUNER if loop == ORIGINAL else of_loop(PRUNER, loop)
-    old = manifest.stores.pruner if loop == ORIGINAL else manifest.loop_pruners[loop]
-    record = manifest.pieces[piece]
+    record, old = manifest.pieces[piece], manifest.pruner_files[loop]
     values = {name: np.asarray(value) for name, value in weights.items()}
-    expected = {name: (str(value.dtype), value.shape) for name, value in own.items()}
+    expected = {name: (str(value.dtype), value.shape) for name, value in artifact.pruners[loop].items()}
     tensors.check_arrays("pruner's weight", values, expected, artifact.path, "Calibrate this artifact again.")
     files = {name: one for name, one in manifest.files.items() if name not in (old, record.file)}
     content = tensors.serialize(values)

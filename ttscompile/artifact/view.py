@@ -44,7 +44,7 @@ class View:
     @property
     def pruner(self) -> Arrays:
         """Constants of this loop's pruner."""
-        return self.artifact.loop_pruners.get(self.variant.loop, self.artifact.pruner)
+        return self.artifact.pruners.get(self.variant.loop, self.artifact.pruner)
 
     @property
     def groups(self) -> int:
@@ -121,12 +121,8 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
         plan = artifact.default if plan is None else artifact.plan(plan)
     manifest, variant = artifact.manifest, plan.variant
     _require(manifest, variant)
-    start, tables, loop = None, artifact.tables, variant.loop
-    record = manifest.starts.get(loop)
-    base = loop if record is None else record.loop
-    sampler = manifest.sampler_of(base)
-    if base != ORIGINAL:
-        tables = artifact.loop_tables[base]
+    start, base, record = None, manifest.whole_loop(variant.loop), manifest.starts.get(variant.loop)
+    sampler, tables = manifest.sampler_of(base), artifact.loop_tables[base]
     if record is not None:
         sampler, start = rest_of(sampler, record.steps)
         tables = MappingProxyType({name: rows[start.skipped :] for name, rows in tables.items()})
@@ -168,8 +164,7 @@ def _require(manifest: Manifest, variant: Variant) -> None:
 
 def require_held(artifact: Artifact, plan: Plan) -> None:
     """Raise ArtifactError unless the artifact holds models for every precision of a plan."""
-    record = artifact.manifest.precision
-    held = {} if record is None else dict.fromkeys(record.kept, record.name)
+    held = artifact.manifest.held
     if not held.items() <= plan.precision.items():
         artifact.require_whole()
     for part, precision in plan.precision.items():

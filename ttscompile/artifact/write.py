@@ -182,9 +182,9 @@ def update_plans(
                 directory, manifest, "plans", stores.plan_arrays_of(manifest, plans, envelope or artifact.envelope)
             )
             trained = {**artifact.block_weights, **{name: own.weights for name, own in (weights or {}).items()}}
-            pruners = dict[str, Arrays]()
+            pruners = dict(artifact.pruners)
             if pruner_weights is not None:
-                own = pruner_loop if pruner_loop in manifest.loop_pruners else ORIGINAL
+                own = pruner_loop if pruner_loop in pruners else ORIGINAL
                 manifest = stores.store_pruner(artifact, manifest, pruner_weights, own)
                 pruners[own] = pruner_weights
             after = replace(
@@ -192,8 +192,7 @@ def update_plans(
                 block_weights={name: trained[name] for name in manifest.weights},
                 manifest=manifest,
                 plans={DENSE: artifact.plans[DENSE], **{n: replace(plans[n], repair=True) for n in manifest.plans}},
-                pruner=pruners.pop(ORIGINAL, artifact.pruner),
-                loop_pruners={**artifact.loop_pruners, **pruners},
+                pruners=pruners,
             )
             manifest = stores.store_arrays(
                 directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after))

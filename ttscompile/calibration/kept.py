@@ -8,7 +8,7 @@ from ..artifact.ceiling import FARTHEST
 from ..artifact.manifest import StartRecord, WeightsRecord
 from ..artifact.stores import BlockWeights
 from ..core.coercion import Arrays
-from ..core.plan import DENSE, FULL, Plan
+from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..errors import CalibrationFailedError
 from ..measure.points import SAME
 from .clock import Clock
@@ -194,16 +194,13 @@ def holding(trials: Trials, proposal: Proposal) -> Trials:
     artifact, manifest, loop = trials.artifact, trials.artifact.manifest, proposal.plan.loop
     added = {name: own.weights for name, own in proposal.weights.items()}
     known = {**manifest.weights, **{name: WeightsRecord(name, {}, None, {}) for name in added}}
-    pruner, pruners = artifact.pruner, dict(artifact.loop_pruners)
-    if proposal.pruner is not None and loop in pruners:
-        pruners[loop] = proposal.pruner
-    elif proposal.pruner is not None:
-        pruner = proposal.pruner
+    pruners = dict(artifact.pruners)
+    if proposal.pruner is not None:
+        pruners[loop if loop in pruners else ORIGINAL] = proposal.pruner
     held = replace(
         artifact,
         manifest=replace(manifest, starts={**manifest.starts, **proposal.starts}, weights=known),
         block_weights={**artifact.block_weights, **added},
-        pruner=pruner,
-        loop_pruners=pruners,
+        pruners=pruners,
     )
     return replace(trials, artifact=held, fresh=trials.fresh or bool(added) or proposal.pruner is not None)

@@ -164,14 +164,13 @@ def replay(
         Executed plans ``[2, B, K, blocks]``; the cells ``[K, blocks]`` that are not those of the record; whether these
         may differ; and the error of the samples, with the stored plan where cells differ.
     """
-    spec, start = artifact.manifest.spec, artifact.manifest.starts.get(plan.loop)
-    loop = plan.loop if start is None else start.loop
-    own, obs = golden.in_loop(loop), golden.network_observations(spec)
+    loop = artifact.manifest.whole_loop(plan.loop)
+    own, obs = golden.in_loop(loop), golden.network_observations(artifact.manifest.spec)
 
     def episode(plans: Iterable[Plan]) -> tuple[PlanArray, Array]:
         made, samples = [], []
         runtime.reset()
-        if start is not None:  # the chunk before the first call is that of the original
+        if loop != plan.loop:  # the chunk before the first call is that of the original
             runtime.predict(obs, own.noise, computed(artifact, loop))
         for order, one in zip((1, -1), plans, strict=True):
             draws = None if own.draws is None else np.ascontiguousarray(own.draws[:, ::order])

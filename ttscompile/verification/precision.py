@@ -57,9 +57,9 @@ def check_precision(artifact: Artifact, golden: Golden, runtime: Runtime) -> Run
         told = f"the integers of {constant!r} are up to {off:.3g} of their steps off; rounded weights are half of one"
         remedy = "They were changed or exchanged: convert the checkpoint again."
         return Rung(PRECISION, FAILED, told, off, HALF, "of a step", remedy)
-    obs, parts, error = golden.network_observations(spec), dict.fromkeys(record.kept, record.name), 0.0
+    obs, error = golden.network_observations(spec), 0.0
     for loop in spec.all_loops:
-        own, plan = golden.in_loop(loop), computed(artifact, loop, parts)
+        own, plan = golden.in_loop(loop), computed(artifact, loop, artifact.manifest.held)
         runtime.reset()
         share = np.linalg.norm(runtime.predict(obs, own.noise, plan)[0] - own.sample) / np.linalg.norm(own.sample)
         error = max(error, float(share) if np.isfinite(share) else math.inf)

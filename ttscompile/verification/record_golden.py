@@ -160,8 +160,7 @@ def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
         own = {name: plan for name, plan in plans.items() if plan.variant == variant}
         view = view_of(artifact, next(iter(own.values())))
         model = ReferenceModel.from_view(view)  # one at a time: each holds all weights
-        start = artifact.manifest.starts.get(variant.loop)
-        record = golden.in_loop(variant.loop if start is None else start.loop)
+        record = golden.in_loop(artifact.manifest.whole_loop(variant.loop))
         with torch.no_grad():
             found |= {name: _episode(view, model, plan, record, obs) for name, plan in own.items()}
     return {name: found[name] for name in plans}
