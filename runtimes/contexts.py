@@ -86,7 +86,7 @@ class ContextValues:
             self._by_step[name][...] = value.reshape(self._by_step[name].shape)
 
     def take(self, whole: ContextValues, index: Any) -> None:
-        """The values of some streams of a batch."""
+        """Copy the values of some streams of a batch."""
         move = self._module.moveaxis
         for name, context in self._manifest.contexts.items():
             own, theirs, axis = self.values[name], whole.values[name], context.type.batch_axis

@@ -39,7 +39,7 @@ def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
 
 
 class LoweringCache(Generic[Lowered]):
-    """The last plans, ``capacity`` of them, that were lowered: schedules once, the pruner's plans when they change."""
+    """Keeps the last ``capacity`` plans that were lowered: so a schedule is lowered once."""
 
     def __init__(self, lower: Callable[[PlanArray], Lowered], capacity: int = 64) -> None:
         self._lower, self._capacity = lower, capacity

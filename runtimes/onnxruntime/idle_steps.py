@@ -63,7 +63,7 @@ class IdleSteps:
             np.copyto(self._memory, _by_part(memory, self._horizon))
 
     def leave(self, sample: FloatArray, history: FloatArray, memory: FloatArray | None) -> None:
-        """Give it out again, to the same arrays or others."""
+        """Write the state after the steps to such arrays."""
         np.copyto(sample, self._parts[0])
         np.copyto(history, self.history)
         if memory is not None:

@@ -205,7 +205,7 @@ class Workspace:
         self._blocks[b].run(k)
 
     def take(self, whole: Workspace, streams: Sequence[int], cells: Iterable[int]) -> None:
-        """What some streams of a batch have after step 0, and their entries of the rollout cache for these cells."""
+        """Copy what these streams of a batch have after step 0, and their rollout cache for these cells."""
         self._contexts.take(whole._contexts, streams)
         self._correction, self._known, self._read = whole._correction, whole._known, whole._read[streams]
         self._advance = self.advances_with(self._correction, self._known)
@@ -213,7 +213,7 @@ class Workspace:
             own[:] = theirs[streams]
 
     def give(self, whole: Workspace, streams: Sequence[int], cells: Iterable[int]) -> None:
-        """Put the sample of some streams, and their entries of these cells, into those of the batch."""
+        """Copy the sample of these streams, and their entries for these cells, back to the batch."""
         last = self._steps % 2
         np.moveaxis(whole.sample[last], 1, 0)[streams] = np.moveaxis(self.sample[last], 1, 0)
         for cell in cells:

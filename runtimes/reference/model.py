@@ -34,9 +34,9 @@ from .sampler import Carried, TorchSampler, hold
 
 @dataclass(frozen=True)
 class Contexts:
-    """What the observation gives the loop; what it gives each step is made of this when a piece reads it.
+    """What the observation decides before the loop. Step values are made of it when a piece reads them.
 
-    Of all steps together, what a modulated network reads would be megabytes a call.
+    Kept for all steps, those of a modulated network would be megabytes a call.
     """
 
     streams: int

@@ -58,7 +58,7 @@ def _document(content: bytes, where: str) -> dict[str, Any]:
 
 
 def is_as_written(manifest: Manifest, content: bytes) -> bool:
-    """Whether the bytes that a manifest was decoded from are how ttscompile writes it, or wrote it a schema before."""
+    """Whether these bytes are exactly what ttscompile writes for a manifest, or wrote in the schema before."""
     document = _document(content, MANIFEST)
     return content == (encode(manifest) if document["schema_version"] == SCHEMA_VERSION else dump(document))
 

@@ -173,7 +173,7 @@ class Artifact:
         return next((name for name, one in self.plans.items() if one is plan), None)
 
     def told(self, plan: Plan) -> str | None:
-        """What ``plan`` was given to have it; None for one that somebody else made."""
+        """The name by which ``plan`` gives it, ``NAME@int8`` too; None for a plan that is not this artifact's."""
         return self.name_of(plan) or next((name for name, one in self._derived.items() if one is plan), None)
 
     @cached_property

@@ -102,7 +102,7 @@ class View:
 
     @property
     def frames_key(self) -> object:
-        """Equal for views whose frame pieces and scene remember the same of the same observations."""
+        """Equal for views that compute the same of a frame or a scene, and so can share what they remember."""
         pieces = (*frame_pieces(self.manifest.pieces), *{SCENE} & set(self.manifest.pieces))
         return self.variant.tokens, tuple(map(self.onnx_file, pieces))
 

@@ -25,7 +25,7 @@ from ..trajectories.fits import check_ranges
 IntArray = npt.NDArray[np.int64]
 
 FRACTION = 0.25
-"""Share of the episodes that plans are judged on where nothing else is asked for: who splits with the seed of a
+"""Share of the episodes that plans are judged on, if nothing else is asked for. Whoever splits with the seed of a
 calibration judges on episodes that it saw nothing of."""
 
 

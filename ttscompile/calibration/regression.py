@@ -48,7 +48,7 @@ class Components:
 
     @classmethod
     def of(cls, condition: Tensor, most: int) -> Components:
-        """The largest ones of ``[n, N]``, as many at most."""
+        """Those of conditions ``[n, N]`` with the largest deviations, so many of them at most."""
         rows = condition[:, : condition.shape[1] if most else 0].double()
         mean, some = rows.mean(0), rows[:: -(-len(rows) // ROWS)]
         _, lengths, directions = torch.linalg.svd(some - mean, full_matrices=False)

@@ -1,6 +1,6 @@
 """The sparse loop, step by step, on calls that its corrections are fitted on while it goes, and on others beside them.
 
-A place in the loop is a value: several schedules can go on from one, and what they have in common is gone once.
+A place in the loop is a value: several schedules can go on from one, and what they have in common is computed once.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def is_whole(plan: PlanArray) -> bool:
 
 @dataclass(frozen=True)
 class Place:
-    """Before a step of a sparse loop: calls to fit corrections on, others that go along, and jumps that hold."""
+    """Calls before a step of a sparse loop: those to fit corrections on, others that go along, and jumps that hold."""
 
     step: int
     fitted: tuple[_Batch, ...]
@@ -69,7 +69,7 @@ class Place:
 
     @property
     def held(self) -> list[Tensor]:
-        """The samples and residuals of it; places share those that nothing changed between them."""
+        """Its samples and residuals. Places share the tensors that no step between them changed."""
         return [tensor for batch in self.batches for tensor in batch.held]
 
     def forked(self, **fields: Any) -> Place:

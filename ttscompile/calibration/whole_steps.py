@@ -240,10 +240,10 @@ BYTES = 2**29
 
 
 class ScheduleRuns:
-    """The way of schedules through a sparse loop, each gone once.
+    """Takes schedules through a sparse loop. What several of them have in common is computed once.
 
-    Up to the first step in which they differ, two schedules make the same samples and get the same corrections, so the
-    places where they may part are kept. All placements of three steps among 16 take a third of the evaluations so.
+    Two schedules make the same samples and get the same corrections up to the first step in which they differ, so the
+    places where they may part are kept. Then all placements of three steps among 16 take a third of the evaluations.
     """
 
     def __init__(self, loop: SparseLoop, steps: int, blocks: int, most_bytes: int = BYTES) -> None:

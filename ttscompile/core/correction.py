@@ -131,7 +131,7 @@ class Correction:
         object.__setattr__(self, "prefixes", longest)
 
     def of(self, committed: int) -> "Correction":
-        """That of a call with a prefix of so many actions."""
+        """The correction of a call with a prefix of so many actions."""
         return self if not committed or self.late is None else self.late
 
     @cached_property

@@ -76,9 +76,11 @@ Matrices = Mapping[str, tuple[str, Array]]
 def parts_to_lower(
     program: Program, keep_fp32: Collection[str] = ()
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """The parts of a program (``ir.pieces.part_of``) for which another precision is worth while, in order.
+    """Which parts of a program (``ir.pieces.part_of``) get another precision.
 
-    Then those that stay fp32 because ``keep_fp32`` asks for it, ``prologue`` for all but ``blocks``; and notes.
+    Returns:
+        Those for which it is worth while, in order; those that stay fp32 because ``keep_fp32`` asks for it, where
+        ``prologue`` is all but ``blocks``; and notes.
     """
     flops: dict[str, int] = {}
     rows = {frame_name(i): count for i, count in enumerate(program.pieces.rows)}
