@@ -217,15 +217,17 @@ class Trials:
         return self._calls[window]
 
     def _affordable(self, name: str) -> int:
-        """How many calls to learn from are drawn: as many as usual, or more of a small network.
+        """How many calls to learn from are drawn: as many as usual, or more of a small network."""
+        found = QUICKLY * (self.until_share * self.clock.limit - self.begun_at) / _seconds(self.runner.view)
+        known = name in self.state.get("targets")
+        return self._settled(f"{name} drawn", found, self.limits.usual, self.limits.most, known)
 
-        Their noise depends on the number, so it is kept; a state that has answers without it has the usual ones.
+    def _settled(self, key: str, found: float, usual: int, most: int, known: bool) -> int:
+        """How many are asked for, as many as usual at least. It is kept, since their noise depends on it.
+
+        ``known``: whether a state has their answers; one that has them without the number has as many as usual.
         """
-        key = f"{name} drawn"
         if key not in self.state.progress:
-            found = QUICKLY * (self.until_share * self.clock.limit - self.begun_at) / _seconds(self.runner.view)
-            known = name in self.state.get("targets")
-            usual, most = self.limits.usual, self.limits.most
             self.state.progress[key] = usual if known else int(np.clip(found, usual, most))
         return int(self.state.progress[key])
 
@@ -282,13 +284,11 @@ class Trials:
         return _NUMBERS[part], stretch, row, draw
 
     def _draws(self, part: str, calls: int) -> int:
-        """Of noise for each of so many calls; a state that has answers without their number has the usual ones."""
-        key, seconds = f"{part} draws", self.clock.limit
-        if key not in self.state.progress:
-            few = bool(self.state.get(f"{part} answers")) or not np.isfinite(seconds)
-            found = self.draws if few else MORE_DRAWS * seconds / (calls * _seconds(view_of(self.artifact, DENSE)))
-            self.state.progress[key] = int(np.clip(found, self.draws, max(self.draws, MOST_DRAWS)))
-        return int(self.state.progress[key])
+        """Of noise for each of so many calls; as many as usual where there is no limit of time."""
+        seconds, known = self.clock.limit, bool(self.state.get(f"{part} answers"))
+        found = MORE_DRAWS * seconds / (calls * _seconds(view_of(self.artifact, DENSE)))
+        few = known or not np.isfinite(seconds)
+        return self._settled(f"{part} draws", found, self.draws, max(self.draws, MOST_DRAWS), few)
 
     def _in_time(self, part: str, stretches: IntArray, calls: IntArray, draws: int) -> IntArray:
         """As many of these calls as the original answers in their share of the time, evenly spread."""
