@@ -129,6 +129,7 @@ def _read(
     instruction: Instruction | None,
     tokenizer: ReadTokenizer | None,
 ) -> list[Episode]:
+    """The episodes of one recording: what the policy observes, of arrays that may be called otherwise, and of texts."""
     path, limits = local_path(recording), {"most": MOST_EPISODES} if on_hub(recording) else {}
     folder, sources = sources.get(TASK), {key: parts for key, parts in sources.items() if key != TASK}
     if folder is not None and instruction is None:
@@ -155,22 +156,32 @@ def _read(
         arrays |= instruction_rows(path, held, words, observations, tokenizer, arrays)
     if kind is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
-    rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}
+    return _cut(path, arrays, ends, observations, action_steps if frames else None)
+
+
+def _cut(
+    path: Path, arrays: Arrays, ends: list[int], specs: Mapping[str, ObservationSpec], by: int | None
+) -> list[Episode]:
+    """Arrays ``[N, ...]`` by key as episodes: checked, and cut where each ends.
+
+    Rows are frames, of which every ``by``-th is the newest of a call; or calls if that is None.
+    """
+    rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in specs}
     if len(rows) != 1:
-        lengths = {key: arrays[key].shape for key in observations}
+        lengths = {key: arrays[key].shape for key in specs}
         raise TrajectoryError(f"{path}: observations differ in length: {lengths}. Each needs a row for every call.")
     count = rows.pop()
     if ends[-1] > count:
         told = f"{path}: {ENDS} says that the last episode ends at row {ends[-1]}, but there are {count} rows: no such"
         raise TrajectoryError(f"{told} episode is complete. Record it again, or leave the episode out of {ENDS}.")
     if ends[-1] < count:
-        warnings.warn(f"{path}: {count - ends[-1]} rows after the last end of an episode are not used.", stacklevel=4)
-    checked = {key: _checked(path, key, arrays[key], spec, frames) for key, spec in observations.items()}
+        warnings.warn(f"{path}: {count - ends[-1]} rows after the last end of an episode are not used.", stacklevel=5)
+    checked = {key: _checked(path, key, arrays[key], spec, by is not None) for key, spec in specs.items()}
     episodes = []
     for number, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
         part = {key: array[start:end] for key, array in checked.items()}
-        if frames:
-            part = {key: _windows(array, observations[key].frames, action_steps) for key, array in part.items()}
+        if by is not None:
+            part = {key: _windows(array, specs[key].frames, by) for key, array in part.items()}
         episodes.append(Episode(f"{path.name}[{number}]", part))
     return episodes
 
