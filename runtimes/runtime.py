@@ -63,9 +63,16 @@ class _Settled:
     legalised: tuple[int, ...]  # replaced cells of each stream
     pruner: float = 0.0  # ms, from the condition values to the instructions; 0 if the plan was given
 
+    def but(self, some: BoolArray, other: "_Settled") -> "_Settled":
+        """The same with the plans of another where ``some [B]`` is True."""
+        plans = np.where(some[:, None, None], other.plans, self.plans)
+        return replace(self, plans=plans, legalised=tuple(np.where(some, other.legalised, self.legalised).tolist()))
+
 
 @dataclass(frozen=True, eq=False)
 class _Made:
+    """What a call came to."""
+
     sample: FloatArray
     settled: _Settled
     outside: FloatArray  # ``CallReport.outside``
@@ -162,9 +169,8 @@ class Runtime:
         A plan that begins with the chunk of the call before moves it by as many. Where more were due than ``action``
         has, the call is late, and begins with noise: its plan's ``otherwise`` takes its place.
         """
-        spec = self._artifact.manifest.spec.chunk
         self._executed = executed
-        if not 0 <= executed <= spec.stop - spec.start:
+        if not 0 <= executed <= self._artifact.manifest.spec.chunk.executes:
             self._chunk = None
 
     def _end_episode(self) -> None:
@@ -259,16 +265,17 @@ class Runtime:
 
     def _denoised(self, opened: _Opened, plan: Plan, call: Call, settled: _Settled | None) -> _Made:
         """The sample of a call. Streams that are far outside of what was recorded have ``plain_cells``, uncorrected."""
-        backend, envelope, waited, mixed = opened.backend, self._artifact.envelope, 0.0, False
+        backend, envelope, waited = opened.backend, self._artifact.envelope, 0.0
+        outside, far = np.zeros(0, np.float32), np.zeros(len(call.noise.initial), np.bool_)
         start = time.perf_counter()
         backend.start(call)
-        prologue, frames, outside = time.perf_counter(), opened.frames.work, np.zeros(0, np.float32)
-        if plan.correction is None or envelope is None:
-            far = np.zeros(len(call.noise.initial), np.bool_)
-        else:
+        prologue, frames = time.perf_counter(), opened.frames.work
+        if plan.correction is not None and envelope is not None:
             outside = envelope.distance(backend.condition())
             far = outside > FAR
-        if not far.all():
+        if far.all():
+            settled, sample = self._plain(opened, plan, call)
+        else:
             if settled is None:
                 settled, waited = self._prune_beside_first_step(call.written)
             else:
@@ -276,20 +283,9 @@ class Runtime:
             sample = backend.other_steps(settled.lowered)
             if plan.correction is not None:
                 sample = with_prefix(bounded(opened.view.manifest.spec.sampler, sample), call.known)
-        if plan.correction is not None and far.any():
-            cells = plain_cells(plan.correction, call.written.shape[2])
-            plain = self._settle(opened, cells, _Entries(call.written, np.zeros_like(call.written)), True)
-            backend.start(replace(call, obs={}, correction=None))
-            backend.first_step()
-            own, mixed = backend.other_steps(plain.lowered), not far.all()
-            if mixed:
-                assert settled is not None
-                which = far[:, None, None]
-                own, plans = np.where(which, own, sample), np.where(which, plain.plans, settled.plans)
-                legalised = tuple(np.where(far, plain.legalised, settled.legalised).tolist())
-                plain = replace(settled, plans=plans, legalised=legalised)
-            settled, sample = plain, own
-        assert settled is not None
+            if far.any():
+                plain, own = self._plain(opened, plan, call)
+                settled, sample = settled.but(far, plain), np.where(far[:, None, None], own, sample)
         stop = time.perf_counter()
         timings = Timings(
             prologue=_milliseconds(start, prologue),
@@ -299,7 +295,16 @@ class Runtime:
             total=_milliseconds(start, stop),
             frames=frames.waited,
         )
-        return _Made(sample, settled, outside, timings, frames, mixed)
+        return _Made(sample, settled, outside, timings, frames, mixed=bool(far.any() and not far.all()))
+
+    def _plain(self, opened: _Opened, plan: Plan, call: Call) -> tuple[_Settled, FloatArray]:
+        """``plain_cells`` in the place of a plan, and the sample of a call with these. The call's prologue stands."""
+        assert plan.correction is not None  # else no stream is far outside
+        cells = plain_cells(plan.correction, call.written.shape[2])
+        settled = self._settle(opened, cells, _Entries(call.written, np.zeros_like(call.written)), True)
+        opened.backend.start(replace(call, obs={}, correction=None))
+        opened.backend.first_step()
+        return settled, opened.backend.other_steps(settled.lowered)
 
     def noise_spec(self, plan: Plan) -> PolicySpec:
         """What noise has to fit: of the loop whose last steps these are, where the plan begins with a chunk."""
@@ -322,13 +327,13 @@ class Runtime:
         finally:
             wait([pruning])  # it reads the backend's memory: nobody may go on before it is done, not even with an error
 
-    def _settle(self, opened: _Opened, plan: PlanArray, entries: _Entries, repair: bool) -> _Settled:
-        """Cells that were given.
+    def _settle(self, opened: _Opened, cells: PlanArray, entries: _Entries, repair: bool) -> _Settled:
+        """The plans of cells that were given, repaired if they may be; illegal ones are refused.
 
         Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
         """
         streams, steps, blocks = entries.written.shape
-        wanted = check_plan(plan, steps, blocks, streams)
+        wanted = check_plan(cells, steps, blocks, streams)
         plans = without_illegal_reads(wanted, entries.written) if repair else wanted
         rollout = wanted == Source.ROLLOUT.value
         if (rollout & entries.dropped).any():
