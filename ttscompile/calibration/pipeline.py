@@ -25,7 +25,7 @@ from ..verification.record_golden import record_plans
 from .arguments import calls_to_learn_from, require_directory, require_limits, require_no_cells, require_one_place
 from .budget import DISTANCE, ERROR, LATENCY, goal_of
 from .calls import FRACTION, digest_of, load_episodes
-from .choose import choose, seconds_to_judge_others, seconds_to_time
+from .choose import Frontier, choose, seconds_to_judge_others, seconds_to_time
 from .clock import Clock
 from .judge import Score, other_noise, seconds_to_judge
 from .kept import Kept
@@ -60,7 +60,7 @@ class CalibrationResult:
         budget: what was asked for, the cells that it comes to, and what was measured for it; JSON.
         skipped: why there is no plan of a name that there might be.
         told: by proposer, what became of it.
-        held_out: what tells the episodes of the validation from others.
+        held_out: digest of the episodes of the validation, which tells them from others.
         frontier: where the default was chosen among many plans, all of them, fastest first; JSON.
         timed_on: where these were timed (``measure.machine``).
     """
@@ -202,22 +202,23 @@ def calibrate(
         max_intervals = integer(max_intervals, "max_intervals", CalibrationError, 1)
     require_limits(validation_fraction, max_minutes, max_distance, policy_hz)
     require_one_place(device, ray)
-    torch_device = None if device is None else device_of(device)
+    place = None if device is None else device_of(device)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
     rows = rows_of(tuple(learn))
     chooses, anew = LOOPS in learn, any(row.anew for row in rows)
+    corrects, trains = correct or any(row.corrects for row in rows), any(row.trains for row in rows)
     if chooses:
         require_no_cells(target_sparsity, target_flops, max_action_error)
     directory = Path(path)
     require_directory(directory)
     # All the while: a second calibration would undo the first.
-    with locked(directory), opened_pool(ray) as pool, exact_arithmetic(torch_device):
+    with locked(directory), opened_pool(ray) as pool, exact_arithmetic(place):
         artifact = load_artifact(directory)
         if anew:  # that of an earlier calibration would judge this one's plans
             artifact = replace(artifact, envelope=None)
-        view = view_of(artifact, base_of(artifact))
-        goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
+        manifest = view_of(artifact, base_of(artifact)).manifest
+        goal = goal_of(*asked, usual=usual_sparsity(manifest.steps))
         request = Request(goal, correct, max_intervals, rank, updates, margin=max_distance)
         if chooses:  # the distance is that of what is chosen in the end, and not of each that learns
             request = replace(request, margin=None, deadline_ms=latency_ms, by_time=True, threads=goal.threads)
@@ -228,11 +229,8 @@ def calibrate(
             if (reason := proposer.applies(artifact)) is not None:
                 raise CalibrationError(reason)
         episodes = load_episodes(artifact.manifest.spec, trajectories, observation, artifact.tokenizer)
-        corrects = correct or any(row.corrects for row in rows)
         rate = policy_hz or recorded_rate(trajectories) or (artifact.manifest.calibration or {}).get("policy_hz")
-        trains = any(row.trains for row in rows)
         chosen_anew = chooses and not trains  # weights are trained for what was best
-        limits = calls_to_learn_from(view.manifest, max_minutes, corrects=corrects, trains=trains)
         settings = {
             # Where plans stay, these too: what is learned is learned for one of them.
             "model": (artifact.manifest.model_identity if anew else artifact.manifest.identity)[:16],
@@ -245,7 +243,7 @@ def calibrate(
             "validation_fraction": validation_fraction,
             "max_distance": None if chosen_anew else max_distance,
             "correct": correct,
-            "device": "cpu" if torch_device is None else str(torch_device),
+            "device": "cpu" if place is None else str(place),
             "max_intervals": max_intervals,
             "rank": rank,
             "updates": updates,
@@ -253,12 +251,12 @@ def calibrate(
         state = StateFile(directory, settings)
         if not (resume and state.load()):
             state.remove()
+        limits = calls_to_learn_from(manifest, max_minutes, corrects=corrects, trains=trains)
         # The number stays whatever time there is to go on.
         limits = limits._replace(usual=state.progress.setdefault("calls", limits.usual))
-        before = float(state.progress.get("seconds", 0.0)) + begun.elapsed()
-        clock = Clock(60 * max_minutes, before, wall)
+        clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)) + begun.elapsed(), wall)
         with Bar(progress) as bar:
-            opened = {"clock": clock, "bar": bar, "pool": pool, "device": torch_device, "limits": limits}
+            opened = {"clock": clock, "bar": bar, "pool": pool, "device": place, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
             if chooses:
                 require_two_calls(trials)
@@ -275,26 +273,8 @@ def calibrate(
         # Where no schedule is learned: what one would have been asked for.
         schedule = next((one for one in proposers if isinstance(one, Schedule)), Schedule(request, SCHEDULES[0]))
         asked_of_default = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
-        result = CalibrationResult(
-            learned=tuple(row.name for row in rows),
-            seed=seed,
-            target_sparsity=schedule.budget.sparsity(view.manifest),
-            default_plan=kept.default,
-            plans=kept.scores,
-            other_noise=other_noise(trials),
-            policy_hz=rate,
-            skipped={**schedule.skipped, **kept.refused},
-            episodes={"calibration": trials.split.calibration, "validation": trials.split.validation},
-            calls={"calibration": trials.used, "validation": len(trials.held_out.calls)},
-            intervals=schedule.intervals,
-            stopped=schedule.stopped or (TIME_LIMIT if clock.left_out else FINISHED),
-            seconds=clock.elapsed(),
-            budget=asked_of_default if chooses else schedule.budget.record(),
-            told=kept.told,
-            held_out=digest_of([episodes[n] for n in trials.split.validation]),
-            frontier=() if frontier is None else frontier.tried,
-            timed_on=None if frontier is None else timed_on(goal.threads),
-        )
+        budget = asked_of_default if chooses else schedule.budget.record()
+        result = _result(trials, rows, kept, frontier, schedule, budget, rate)
         _warn_of_result(bar, result, max_minutes, clock.left_out)
         _write(directory, artifact, result, kept, anew)
         if not (chooses and result.default_plan == DENSE):  # more time, or a larger error, may go on from there
@@ -323,6 +303,39 @@ def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock:
         raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
     for name, reason in kept.refused.items():
         kept.trials.bar.warn(f"{name!r} is left out: it {reason}")
+
+
+def _result(
+    trials: Trials,
+    rows: Sequence[Row],
+    kept: Kept,
+    frontier: Frontier | None,
+    schedule: Schedule,
+    budget: Mapping[str, Any],
+    rate: float | None,
+) -> CalibrationResult:
+    """What came of it; ``rate`` is ``policy_hz``."""
+    split, clock = trials.split, trials.clock
+    return CalibrationResult(
+        learned=tuple(row.name for row in rows),
+        seed=trials.seed,
+        target_sparsity=schedule.budget.sparsity(trials.runner.view.manifest),
+        default_plan=kept.default,
+        plans=kept.scores,
+        other_noise=other_noise(trials),
+        policy_hz=rate,
+        skipped={**schedule.skipped, **kept.refused},
+        episodes={"calibration": split.calibration, "validation": split.validation},
+        calls={"calibration": trials.used, "validation": len(trials.held_out.calls)},
+        intervals=schedule.intervals,
+        stopped=schedule.stopped or (TIME_LIMIT if clock.left_out else FINISHED),
+        seconds=clock.elapsed(),
+        budget=budget,
+        told=kept.told,
+        held_out=digest_of([trials.episodes[n] for n in split.validation]),
+        frontier=() if frontier is None else frontier.tried,
+        timed_on=None if frontier is None else timed_on(schedule.request.goal.threads),
+    )
 
 
 def _warn_of_result(bar: Bar, result: CalibrationResult, max_minutes: float, left_out: Sequence[str]) -> None:
