@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -61,6 +61,27 @@ if TYPE_CHECKING:
 
 Explain = Callable[[str, tuple[str, ...]], None]
 """Called with the name of each stage and what it did, one note a line."""
+
+
+@dataclass(frozen=True)
+class _Output:
+    """What is written of a program: arguments of ``convert`` and of ``write_artifact``, by the same names.
+
+    The single file is of ``loop``.
+    """
+
+    directory: str | os.PathLike[str] | None
+    single_file: str | os.PathLike[str] | None
+    precision: str
+    keep_fp32: Collection[str]
+    loop: str = ORIGINAL
+    beside: Mapping[str, bytes] | None = None
+    tokenizer: bytes | None = None
+
+    def __post_init__(self) -> None:
+        require_precision(self.precision, self.keep_fp32)
+        if self.single_file is not None:
+            _require_apart(self.single_file, self.directory)
 
 
 def convert(
@@ -146,9 +167,8 @@ def convert(
     if spec.instruction is not None:
         explain("tokenizer_of", (words,))
     loop = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL)
-    return _compile(
-        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, loop, beside, tokenizer
-    )
+    output = _Output(directory, single_file, precision, keep_fp32, loop, beside, tokenizer)
+    return _compile(module, spec, prediction_horizon, output, explain)
 
 
 def compile_denoiser(
@@ -184,33 +204,22 @@ def compile_denoiser(
         TtscompileError: it cannot be captured, it has no residual blocks, or the artifact cannot be written.
     """
     module = own_copy(module)  # the program, which is returned, shares memory with it
-    return _compile(module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain)
+    output = _Output(directory, single_file, precision, keep_fp32)
+    return _compile(module, spec, prediction_horizon, output, explain)
 
 
 def _compile(
     module: nn.Module,
     spec: PolicySpec,
-    directory: str | os.PathLike[str] | None,
     prediction_horizon: int | Literal["needed"] | None,
-    precision: str,
-    keep_fp32: Collection[str],
-    single_file: str | os.PathLike[str] | None,
+    output: _Output,
     explain: Explain,
-    loop: str = ORIGINAL,
-    beside: Mapping[str, bytes] | None = None,
-    tokenizer: bytes | None = None,
 ) -> Program:
-    """See ``compile_denoiser``. The single file is of ``loop``; what is ``beside`` and the tokenizer go with it.
-
-    Nobody else may change the module: the program shares memory with it.
-    """
-    require_precision(precision, keep_fp32)
+    """See ``compile_denoiser``. Nobody else may change the module: the program shares memory with it."""
     if prediction_horizon == "needed":
         prediction_horizon = needed(module, spec)
     elif prediction_horizon is not None:
         prediction_horizon = integer(prediction_horizon, "prediction_horizon", SpecError, 1)
-    if single_file is not None:
-        _require_apart(single_file, directory)
     if prediction_horizon is not None or spec.left_out:
         kept = spec.sample[0] if prediction_horizon is None else prediction_horizon
         spec, changed = narrow(module, spec.whole_horizon, kept)
@@ -219,34 +228,41 @@ def _compile(
     program = transform(module, spec, explain=explain)
     if prediction_horizon is None and (hint := unneeded(module, spec)) is not None:
         explain("narrow", (hint,))
-    if directory is None and single_file is None:
-        return program
+    if output.directory is not None or output.single_file is not None:
+        _write(program, module, output, explain)
+    return program
+
+
+def _write(program: Program, module: nn.Module, output: _Output, explain: Explain) -> None:
+    """Lower a program, and write it: as an artifact, as a single file, or as both."""
+    precision, loop, loops = output.precision, output.loop, program.spec.loops
     models = lower_program(program)
     explain("lower", (f"{len(models)} ONNX models",))
-    lowered = None if precision == FP32 else _lower_pieces(program, models, precision, keep_fp32, explain)
+    lowered = None if precision == FP32 else _lower_pieces(program, models, precision, output.keep_fp32, explain)
     whole: bytes | None = None
-    if single_file is not None:  # made before anything is written: without one there is no artifact either
+    if output.single_file is not None:  # made before anything is written: without one there is no artifact either
         own, weights = ({}, {}) if lowered is None else (lowered.models, lowered.weights)
         model = lower_single_file(program, {**models, **own}, {**program.weights, **weights}, loop)
         whole = model.SerializeToString(deterministic=True)
-    if directory is not None:
+    if output.directory is not None:
         golden = record_original(module, program)
-        told = f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams"
-        further = (f"{name}: {len(golden.loops[name].steps)} of {table.steps}" for name, table in spec.loops.items())
+        told = f"{len(golden.steps)} of {program.spec.sampler.steps} steps, {golden.streams} streams"
+        further = (f"{name}: {len(golden.loops[name].steps)} of {table.steps}" for name, table in loops.items())
         explain("record_original", (told, *further))
-        manifest = write_artifact(program, models, directory, lowered, golden, beside or {}, loop, tokenizer)
+        more = output.beside or {}, loop, output.tokenizer
+        manifest = write_artifact(program, models, output.directory, lowered, golden, *more)
         explain("write", (f"identity {manifest.short_identity}",))
-    if whole is not None and single_file is not None:
+    if whole is not None and output.single_file is not None:
+        file = Path(output.single_file)
         try:
-            Path(single_file).parent.mkdir(parents=True, exist_ok=True)
-            replace_file(Path(single_file), whole)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(file, whole)
         except OSError as error:
             told = f"the single file cannot be written: {error}"
-            raise ArtifactError(f"{single_file}: {told}. Give another path.") from error
+            raise ArtifactError(f"{output.single_file}: {told}. Give another path.") from error
         other = "reuse tokens, " * bool(program.pieces.tokens) + "have weights of their own or begin with"
         told = f"it runs plans of loop {loop!r} in {precision}, but none that {other} the chunk of the call before"
         explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB", f"{told}: ttscompile.load runs these"))
-    return program
 
 
 def _require_apart(single_file: str | os.PathLike[str], directory: str | os.PathLike[str] | None) -> None:
