@@ -64,11 +64,11 @@ def busy() -> str | None:
     return f"{told}. Measure again when they are done." if load > BUSY * cores else None
 
 
-def memory_bytes(limit: Path | None = None) -> int:
+def memory_bytes() -> int:
     """What this machine has, or what its container may take of it, whichever is less."""
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     with suppress(OSError, ValueError):  # no such file; or it says "max"
-        return min(whole, int((CGROUP if limit is None else limit).read_text()))
+        return min(whole, int(CGROUP.read_text()))
     return whole
 
 
