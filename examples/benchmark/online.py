@@ -4,9 +4,11 @@
 
 A criterion (TeaCache, DBCache) is fitted to recorded calls for each share of reused cells. Then it answers held-out
 calls twice: it decides at each step what to compute (``ttscompile.rivals.deciding``), and as the one plan that
-calibration freezes it into. Beside these stand what other proposers find for the same shares, and the plans of the
-artifact. All take turns on one thread of onnxruntime, so that errors can be compared at equal milliseconds. Errors are
-against the same loop with every step computed, and the same noise. Nothing is written.
+calibration freezes it into. It does both once more with corrections, if they are better: that of the plan, and, where
+it decides, those for each step and for how long ago one was computed (``ttscompile.rivals.ages``). Beside these stand
+what other proposers find for the same shares, and the plans of the artifact. All take turns on one thread of
+onnxruntime, so that errors can be compared at equal milliseconds. Errors are against the same loop with every step
+computed, and the same noise. Nothing is written.
 """
 
 from __future__ import annotations
@@ -53,6 +55,7 @@ from ttscompile.core.spec import FloatArray, Noise, PolicySpec
 from ttscompile.errors import CalibrationError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Timer
+from ttscompile.rivals.ages import Table, fit_table
 from ttscompile.rivals.deciding import Deciding
 from ttscompile.rivals.online import Criterion
 from ttscompile.runtimes.open import open_runtime
@@ -75,7 +78,7 @@ class Row:
 
     Attributes:
         name: of the proposer and the share of reused cells, or of the artifact's plan.
-        decides: ``online``, ``frozen``, or nothing where there is nothing to decide.
+        decides: ``online``, ``frozen``, or nothing where there is nothing to decide; and whether it is corrected.
         cells: computed in a call, mean and most.
         error: mean absolute difference of the executed actions from the original's, in their units.
         ms: of the processor, median of a call.
@@ -109,11 +112,13 @@ class Contestants:
 
     Attributes:
         truth: answers with every cell of the loop computed.
+        tried: by name, what a criterion's errors were on calls to learn from, see ``Tabled``.
     """
 
     def __init__(self, artifact: Artifact, base: Plan) -> None:
         self._artifact, self._base = artifact, base
         self.answers: dict[tuple[str, str], Answer] = {}
+        self.tried: dict[str, tuple[float, float, float]] = {}
         self.truth = self.add_plan("every step", "", base)
 
     def add_plan(self, name: str, decides: str, plan: Plan) -> Answer:
@@ -128,19 +133,29 @@ class Contestants:
         self.answers[name, decides] = answer
         return answer
 
-    def add_found(self, name: str, found: Found) -> None:
-        """What a search found; its criterion, too, if it has one."""
+    def add_found(self, name: str, found: Found, task: Task) -> None:
+        """What a search found for a task; its criterion, too, if it has one."""
         criterion = found.notes.get("criterion")
         plan = replace(self._base, cells=found.schedule, correction=found.correction, repair=True)
         self.add_plan(name, "frozen" if criterion else "", plan)
         if criterion:
-            deciding = Deciding(self._artifact, self._base, Criterion.of_record(criterion))
+            rule = Criterion.of_record(criterion)
+            self._add_criterion(name, "online", rule, ())
+            if (correction := task.corrected(found).correction) is not None:
+                self.add_plan(name, "frozen, corrected", replace(plan, correction=correction))
+            tabled = fit_table(task, rule)
+            self.tried[name] = tabled.errors
+            if tabled.table:
+                self._add_criterion(name, "online, corrected", rule, tabled.table)
 
-            def answer(obs: Observation, noise: Noise) -> tuple[FloatArray, PlanArray]:
-                deciding.forget_frames()
-                return deciding.predict(obs, noise)
+    def _add_criterion(self, name: str, decides: str, rule: Criterion, table: Table) -> None:
+        deciding = Deciding(self._artifact, self._base, rule, table=table)
 
-            self.answers[name, "online"] = answer
+        def answer(obs: Observation, noise: Noise) -> tuple[FloatArray, PlanArray]:
+            deciding.forget_frames()
+            return deciding.predict(obs, noise)
+
+        self.answers[name, decides] = answer
 
 
 def measured(contestants: Contestants, spec: PolicySpec, judged: Judged, rounds: int) -> list[Row]:
@@ -228,13 +243,15 @@ def main(
             for name in learn:
                 bar.stage(f"{name} {share:g}", 1, 0)
                 try:
-                    found, _ = plan_of(name, replace(task, budget=cells, pruner={}), seconds=60 * max_minutes)
-                    contestants.add_found(f"{name} {share:g}", found)
+                    own = replace(task, budget=cells, pruner={})
+                    found, _ = plan_of(name, own, seconds=60 * max_minutes)
+                    contestants.add_found(f"{name} {share:g}", found, own)
                 except CalibrationError as error:
                     left_out.append(f"{name} {share:g}: {error}")
         rows = sorted(measured(contestants, spec, judged, rounds), key=lambda one: one.ms)
     if as_json:
-        print_json({"rows": [asdict(one) for one in rows], "left_out": left_out, "machine": fingerprint()})
+        told = {"tables": contestants.tried, "left_out": left_out, "machine": fingerprint()}
+        print_json({"rows": [asdict(one) for one in rows], **told})
         return
     output, made = results_console(), table("plan", "decides", "cells", "most", "error", "ms a call", "quartiles")
     for one in rows:
@@ -243,6 +260,11 @@ def main(
             one.name, one.decides, f"{one.cells[0]:.0f}", str(one.cells[1]), f"{one.error:.3g}", f"{one.ms:.1f}", spread
         )
     output.print(made)
+    for name, errors in contestants.tried.items():
+        shown = "without a correction {:.3g}, with one for each step {:.3g}, for each step and age {:.3g}".format(
+            *errors
+        )
+        say(output, f"{name}, online, on episodes that corrections were not fitted on, normalised: {shown}.")
     say(output, *left_out, one_line(fingerprint()))
     say(
         output,

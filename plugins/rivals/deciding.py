@@ -12,7 +12,7 @@ that is computed whole cannot be one session.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -21,11 +21,13 @@ from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 from ttscompile.core.plan import Plan
 from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.core.update import bounded
 from ttscompile.runtimes.backend import Call
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.sessions import Sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 
+from .ages import Table
 from .online import Criterion, Decisions
 
 
@@ -35,18 +37,24 @@ class Deciding:
     Args:
         plan: whose loop, weights and precision the calls have; its cells and its correction are not read.
         threads: of arithmetic.
+        table: corrections by age, see ``ages``; empty for none.
 
     Raises:
         RuntimeUnavailableError: onnxruntime is missing.
         IllegalPlanError: the plan names what the artifact lacks.
     """
 
-    def __init__(self, artifact: Artifact, plan: Plan, criterion: Criterion, threads: int = 1) -> None:
+    def __init__(
+        self, artifact: Artifact, plan: Plan, criterion: Criterion, threads: int = 1, table: Table = ()
+    ) -> None:
         view = view_of(artifact, plan)
         self._spec, self._criterion = view.manifest.spec, criterion
         self._shape = view.manifest.steps, len(view.manifest.blocks)
         self._axis = view.manifest.blocks[0].type.batch_axis or 0
-        self._backend = OnnxBackend(view, Sessions(threads), {})
+        self._backend, self._table = OnnxBackend(view, Sessions(threads), {}), table
+        # What is added to the sample beside the features' part, in the place of what age 0 has.
+        self._bias = [one.bias - table[0].bias for one in table]
+        self._observed = [one.observed - table[0].observed for one in table]
         Decisions(criterion, *self._shape, 1)  # refused before the first call
 
     def forget_frames(self) -> None:
@@ -56,6 +64,8 @@ class Deciding:
     def predict(self, obs: Mapping[str, FloatArray], noise: Noise) -> tuple[FloatArray, PlanArray]:
         """One call. Streams decide for themselves; a block is computed for all of them where one of them computes it.
 
+        With corrections the streams go through the loop one after the other, since their ages differ.
+
         Args:
             obs: normalised observations by key, ``[B, ...]`` each.
             noise: of the loop; see ``Runtime.predict``.
@@ -64,19 +74,34 @@ class Deciding:
             The denoised sample, float32 ``[B, T, D]``, and what was decided, int8 ``[B, K, blocks]``.
         """
         streams, backend = len(noise.initial), self._backend
+        if self._table and streams > 1:
+            calls = [self.predict(*one) for one in _each(obs, noise)]
+            samples, plans = zip(*calls, strict=True)
+            return np.concatenate(samples), np.concatenate(plans)
         steps, blocks = self._shape
         backend.prepare(streams, None if self._criterion.always else ())  # with sessions of single blocks, or without
         nothing = np.zeros(self._shape, np.bool_)
         obs = {**obs, **self._spec.committed(streams, 0)}
-        backend.start(Call(obs, noise, None, None, nothing, np.broadcast_to(nothing, (streams, *self._shape))))
+        written, correction = np.broadcast_to(nothing, (streams, *self._shape)), self._table[0] if self._table else None
+        backend.start(Call(obs, noise, correction, None, nothing, written))
         work = backend.workspace
         assert work is not None  # ``prepare``
         decisions, rows = Decisions(self._criterion, steps, blocks, streams), list[PlanArray]()
+        read, age = None if correction is None else correction.read(work.condition()), 0
         work.begin()
         for k in range(steps):
             rows.append(self._step(work, k, decisions))
-            work.advance(k)
-        return work.result(), np.stack(rows, 1)
+            age = 0 if rows[-1][0, -1] == Source.COMPUTE else age + 1
+            if read is not None and age:
+                self._advance(work, k, min(age, len(self._table) - 1), read)
+            else:
+                work.advance(k)
+        return bounded(self._spec.sampler, work.result()), np.stack(rows, 1)
+
+    def _advance(self, work: Workspace, k: int, age: int, read: FloatArray) -> None:
+        """What ``Workspace.advance`` does, with the correction of an age above 0, which is no anchor."""
+        work.offset[k] += self._bias[age][k] + np.einsum("bf,fdt->dbt", read, self._observed[age][:, k])
+        work.advances_with(self._table[age]).steps[k].run()
 
     def _step(self, work: Workspace, k: int, decisions: Decisions) -> PlanArray:
         """The blocks of step k, and what was decided about them."""
@@ -97,6 +122,14 @@ class Deciding:
             total = work.fresh + work.current.sum(0)
             np.moveaxis(work.hidden, self._axis, 0)[reused] = np.moveaxis(total, self._axis, 0)[reused]
         return row
+
+
+def _each(obs: Mapping[str, FloatArray], noise: Noise) -> Iterator[tuple[Mapping[str, FloatArray], Noise]]:
+    """Observation and noise of one stream after the other."""
+    for i in range(len(noise.initial)):
+        own = slice(i, i + 1)
+        steps = None if noise.steps is None else noise.steps[:, own]
+        yield {key: one[own] for key, one in obs.items()}, Noise(noise.initial[own], steps)
 
 
 def _run(work: Workspace, k: int, blocks: Sequence[int]) -> None:

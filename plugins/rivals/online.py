@@ -34,6 +34,7 @@ from ttscompile.calibration.runner import Runner, StreamCaches, last
 from ttscompile.calibration.task import Array, Found, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
+from ttscompile.runtimes.reference.model import Blocks
 
 from .dense import dense_steps, some_calls
 from .fixed import COMPARED, best_of, fixed
@@ -189,11 +190,18 @@ class Decided:
 
 def decide(runner: Runner, criterion: Criterion, calls: Calls) -> Decided:
     """Run calls with plans that the criterion decides step by step."""
+    rows: list[PlanArray] = []
+    with torch.no_grad():
+        sample = last(runner.samples(calls, deciding_blocks(runner, criterion, calls, rows)))
+    return Decided(np.stack(rows, 1), sample)
+
+
+def deciding_blocks(runner: Runner, criterion: Criterion, calls: Calls, rows: list[PlanArray]) -> Blocks:
+    """What the blocks make of the stem's stream where the criterion decides; rows of plans are added to ``rows``."""
     model, caches = runner.model, StreamCaches()
     decisions = Decisions(criterion, model.steps, model.blocks, calls.count)
     first, others = range(criterion.always), range(criterion.always, model.blocks)
     computed = np.full((1, model.blocks), Source.COMPUTE, np.int8)
-    rows: list[PlanArray] = []
 
     def blocks(k: int, stem: Tensor) -> Tensor:
         stream = runner.step(computed, k, stem, calls, caches, first)
@@ -201,9 +209,7 @@ def decide(runner: Runner, criterion: Criterion, calls: Calls) -> Decided:
         rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(runner.axes[0], 0).cpu().numpy())))
         return runner.step(rows[-1], k, stream, calls, caches, others)
 
-    with torch.no_grad():
-        sample = last(runner.samples(calls, blocks))
-    return Decided(np.stack(rows, 1), sample)
+    return blocks
 
 
 def fit_threshold(

@@ -47,6 +47,7 @@ class Workspace:
         rollout: entries of the rollout cache by flat index ``k * blocks + b``: copies of computed residuals that a
             later call of the episode can read. One is made when it is first kept, and stays for the next episodes.
         idle: for steps without a computed block; None if the network is of another form.
+        offset: what each step adds to the sample that is known before it, ``[K, D, B, T]``.
     """
 
     def __init__(self, view: View, sessions: Mapping[str, Any], streams: int) -> None:
@@ -65,7 +66,7 @@ class Workspace:
         self.rollout: dict[int, Array] = {}
         self._sums = np.zeros((0, *shape), np.float32)
         self._sampler = manifest.spec.sampler
-        self._offset = np.zeros((self._steps, dimensions, streams, horizon), np.float32)
+        self.offset = np.zeros((self._steps, dimensions, streams, horizon), np.float32)
         self._contexts = ContextValues(manifest, streams, np, np.zeros, view.tables)
         stem = manifest.pieces[STEM]
         assert stem.stream is not None
@@ -85,8 +86,7 @@ class Workspace:
         # By the correction's identity, which the entry keeps from reuse, and whether there is a prefix.
         self._advances: dict[tuple[int, bool], _Advances] = {}
         self._advance = self.advances_with(None)
-        self._dense: dict[int, Bound] = {}
-        self._blocks: list[BoundBlock] = []
+        self._dense, self._blocks = dict[int, Bound](), list[BoundBlock]()
         if block_name(0) in sessions:
             self.bind_blocks()
 
@@ -101,15 +101,15 @@ class Workspace:
         self._history.fill(0)
         if self._memory:
             self._memory[0].fill(0)
-        fill_offset(self._offset, self._sampler, noise, correction)
+        fill_offset(self.offset, self._sampler, noise, correction)
         if obs:
             run_prologue(self._sessions, self._manifest.pieces, obs, self._contexts)
         self._read = np.zeros((self.streams, 0), np.float32)
         if correction is not None and correction.reads:
             self._read = correction.read(self.condition())
-            self._offset += correction.from_condition(self._read)
+            self.offset += correction.from_condition(self._read)
         if known is not None:
-            hold_known(self._offset, known)
+            hold_known(self.offset, known)
 
     def condition(self) -> FloatArray:
         """What a correction reads of the observation, ``[B, N]``."""
@@ -141,7 +141,7 @@ class Workspace:
     def run_idle(self, first: int, stop: int) -> None:
         """Steps that all add the total that ``idle`` has been prepared for."""
         assert self.idle is not None
-        rows = self._advance.updates, self._offset, self._advance.anchors
+        rows = self._advance.updates, self.offset, self._advance.anchors
         for anchor in self._advance.correction.jumps:
             if first <= anchor < stop:
                 self.idle.run(first, anchor + 1, *rows)
@@ -158,7 +158,7 @@ class Workspace:
         added = correction.jump(j, self._read, history)
         if self._known is not None:
             added[self._known.channels, :, self._known.positions] = 0
-        self._offset[landing] += added
+        self.offset[landing] += added
 
     def leave_idle(self, k: int) -> None:
         """Take the state of step k back from ``idle``, and make the residual stream as that step begins."""
@@ -221,7 +221,7 @@ class Workspace:
 
     def _left_by_step_0(self, cells: Iterable[int]) -> list[Array]:
         """What the steps after step 0 go on from, with the streams first: views."""
-        state = [(self.sample[1], 1), (self._history, 1), (self._offset, 2), *((each, 1) for each in self._memory[1:])]
+        state = [(self.sample[1], 1), (self._history, 1), (self.offset, 2), *((each, 1) for each in self._memory[1:])]
         residuals = [(self.fresh, 0), (self.current, 1), *((self.entry(cell), 0) for cell in cells)]
         state += [(array, self._axis + before) for array, before in residuals]
         return [np.moveaxis(array, axis, 0) for array, axis in state]
@@ -256,7 +256,7 @@ class Workspace:
         inputs = {
             STREAM: self.hidden,
             pieces.SAMPLE: self.sample[k % 2],
-            pieces.OFFSET: self._offset[k],
+            pieces.OFFSET: self.offset[k],
             pieces.HISTORY: self._history,
             pieces.UPDATE: update,
             **{name: getattr(self._sampler, name)[k : k + 1] for name in pieces.X0_COLUMNS},

@@ -32,6 +32,9 @@ def test_a_criterion_answers_twice_and_others_once(arguments: list[str]) -> None
     assert rows["every step", ""]["error"] == 0 and rows["every step", ""]["cells"] == [60.0, 60]
     assert rows["taylorseer 0.5", ""]["cells"] == [30.0, 30]
     assert rows["teacache 0.5", "online"]["cells"][0] <= rows["teacache 0.5", "online"]["cells"][1]
+    asked_once_more = {name for name, decides in rows if decides == "online, corrected"}
+    assert set(told["tables"]) == {"teacache 0.5", "teacache 0.8", "dbcache 0.5"}
+    assert asked_once_more == {name for name, (plain, *others) in told["tables"].items() if min(others) < plain}
     times = [row["ms"] for row in told["rows"]]
     assert times == sorted(times)
     shown = CliRunner().invoke(online.main, [*arguments, "--learn", "interval"])
