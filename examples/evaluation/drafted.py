@@ -7,25 +7,29 @@ recorded calls. In a call it drafts the samples of the next steps, and the netwo
 (``falcon.ManySteps``). A draft is taken with a probability that depends on how far its mean is from the one that the
 network gives. The first one that is not is replaced, and drafting begins anew there. Its noise is mirrored (arXiv
 2501.05370), so that samples have the distribution that they have without drafts, however bad these are. TS-DP learns
-from rewards how many steps to draft. Here the number is fixed, and several are tried.
+from rewards how many steps to draft. Here the number is fixed, and several are tried; and the small network's drafts
+are as many as the last round says, as the step says, or as will be taken, which nobody can know (``draft_lengths``).
 
 Beside the small network there is a drafter that costs nothing: the last prediction of the network, again. A loop needs
-noise in its steps for this, so DIR is of DDPM. Times are of torch on one thread, of the same code with and without.
+noise in its steps for this, so DIR is of DDPM. Times are the processor's, of torch on one thread, of the same code with
+and without. All have the same noise, and chance, at each step of a call.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from time import perf_counter
-from typing import Any
+from time import process_time
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
 import torch
+from draft_lengths import Ahead, Place, after_the_last, by_step, fixed, that_will_be_taken
+from drafter import Drafter, trained
 from falcon import ManySteps, output_of
-from torch import Tensor, nn
+from torch import Tensor
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
@@ -39,42 +43,13 @@ from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_opti
 from ttscompile.core.spec import SamplerTable
 from ttscompile.errors import CalibrationError
 from ttscompile.runtimes.reference.model import Contexts
-from ttscompile.runtimes.reference.sampler import Carried, TorchSampler
+from ttscompile.runtimes.reference.sampler import TorchSampler
 
-WIDTH, HEADS, BATCH, RATE = 64, 4, 256, 2e-3
-"""Of the drafter: channels and heads of its one layer, samples of an update, and the learning rate at first."""
+TIMED, TOLD = 2, 16
+"""Calls that rounds of each length are timed on, and those whose rounds say how far they go."""
 
 Draft = Callable[[Tensor, int, Tensor], Tensor]
 """From a sample ``[1, T, D]``, its step and the network's last prediction to a prediction."""
-
-
-class Drafter(nn.Module):
-    """One layer of a transformer over the tokens of a chunk, which knows the step and the observation.
-
-    Args:
-        shape: T and D.
-        steps: of the loop.
-        features: numbers of the observation.
-    """
-
-    def __init__(self, shape: tuple[int, int], steps: int, features: int) -> None:
-        super().__init__()
-        horizon, channels = shape
-        self.embed = nn.Linear(2 * channels, WIDTH)
-        self.place = nn.Parameter(torch.zeros(horizon, WIDTH))
-        self.time = nn.Embedding(steps, WIDTH)
-        self.observe = nn.Linear(features, WIDTH)
-        self.layer = nn.TransformerEncoderLayer(WIDTH, HEADS, 2 * WIDTH, 0.0, batch_first=True, norm_first=True)
-        self.head = nn.Linear(WIDTH, channels)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
-
-    def forward(self, sample: Tensor, k: Tensor, last: Tensor, features: Tensor) -> Tensor:
-        """A prediction ``[N, T, D]``: the network's last one, and what has changed."""
-        hidden = self.embed(torch.cat([sample, last], 2)) + self.place
-        hidden = hidden + (self.time(k) + self.observe(features))[:, None]
-        changed: Tensor = self.head(self.layer(hidden))
-        return last + changed
 
 
 def moved_on(sampler: TorchSampler, sample: Tensor, prediction: Tensor, k: int) -> Tensor:
@@ -115,7 +90,8 @@ class Done:
         rows: all of these.
         drafts: that were checked.
         taken: of them.
-        seconds: of all calls.
+        seconds: of the processor, of all calls.
+        gone: by step, how many steps each round went on that began there.
     """
 
     rounds: int = 0
@@ -123,6 +99,35 @@ class Done:
     drafts: int = 0
     taken: int = 0
     seconds: float = 0.0
+    gone: dict[int, list[int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn for one call, so that it is the same however its steps are drafted.
+
+    Attributes:
+        noise: standard normal, ``[K, 1, T, D]``.
+        chance: uniform from 0 to 1, ``[K]``.
+    """
+
+    noise: Tensor
+    chance: Tensor
+
+    @classmethod
+    def of(cls, steps: int, sample: Tensor, seed: int) -> Drawn:
+        """For so many steps of a sample ``[1, T, D]``."""
+        draw = torch.Generator().manual_seed(seed)
+        return cls(torch.randn(steps, *sample.shape, generator=draw), torch.rand(steps, generator=draw))
+
+
+class Checked(NamedTuple):
+    """After a round of drafts: the sample before step k, the network's last prediction, and how many drafts it took."""
+
+    sample: Tensor
+    k: int
+    prediction: Tensor
+    taken: int
 
 
 class Speculating:
@@ -131,89 +136,64 @@ class Speculating:
     Args:
         runner: of the loop.
         many: its network.
-        seed: of noise and chance.
     """
 
-    def __init__(self, runner: Runner, many: ManySteps, seed: int) -> None:
+    def __init__(self, runner: Runner, many: ManySteps) -> None:
         self._table: SamplerTable = runner.view.manifest.spec.sampler
         self._sampler, self._many = TorchSampler(self._table), many
-        self._steps, self._draw = self._table.steps, torch.Generator().manual_seed(seed)
-        self._model = runner.model
+        self._steps, self._model = self._table.steps, runner.model
+        self._deviations: list[float] = self._table.noise_to_next.tolist()
 
-    def call(self, contexts: Contexts, initial: Tensor, draft: Draft, ahead: int, done: Done) -> Tensor:
-        """The denoised sample ``[1, T, D]``; drafts ``ahead - 1`` steps after the next one, whose sample is known."""
-        begun = perf_counter()
+    def call(self, contexts: Contexts, initial: Tensor, draft: Draft, ahead: Ahead, drawn: Drawn, done: Done) -> Tensor:
+        """The denoised sample; a round checks the next step, whose sample is known, and drafts after it."""
+        begun = process_time()
         prediction = output_of(self._model, initial, 0, contexts)
-        sample, k = self._noisy(moved_on(self._sampler, initial, prediction, 0), 0), 1
-        done.rounds, done.rows = done.rounds + 1, done.rows + 1
-        while k < self._steps:
-            steps = range(k, min(k + ahead, self._steps))
-            samples, means, noises = [sample], list[Tensor](), list[Tensor]()
-            for step in steps:
-                means.append(moved_on(self._sampler, samples[-1], draft(samples[-1], step, prediction), step))
-                noises.append(torch.randn(sample.shape, generator=self._draw))
-                samples.append(means[-1] + float(self._table.noise_to_next[step]) * noises[-1])
-            found = self._many.outputs(samples[:-1], steps, contexts)
-            done.rounds, done.rows = done.rounds + 1, done.rows + len(steps)
-            for place, step in enumerate(steps):
-                prediction = found[place]
-                wanted = moved_on(self._sampler, samples[place], prediction, step)
-                chance = float(torch.rand((), generator=self._draw))
-                deviation = float(self._table.noise_to_next[step])
-                sample, drafted = settled(wanted, means[place], noises[place], deviation, chance)
-                k = step + 1
-                if deviation:
-                    done.drafts, done.taken = done.drafts + 1, done.taken + drafted
-                if not drafted:
-                    break
-        done.seconds += perf_counter() - begun
-        return sample
+        mean = moved_on(self._sampler, initial, prediction, 0)
+        at = Checked(mean + self._deviations[0] * drawn.noise[0], 1, prediction, 0)
+        done.seconds += process_time() - begun
+        done.rounds, done.rows, asked, gone = done.rounds + 1, done.rows + 1, 0, 0
+        while at.k < self._steps:
+            left = self._steps - at.k
 
-    def plain(self, contexts: Contexts, initial: Tensor, done: Done) -> Tensor:
+            def checked(count: int, at: Checked = at, left: int = left) -> Checked:
+                return self._round(contexts, at, draft, range(at.k, at.k + min(count, left)), drawn)
+
+            asked = min(left, ahead(Place(at.k, asked, gone, lambda count, at=at: checked(count).k - at.k)))
+            begun, after = process_time(), checked(asked)
+            done.seconds += process_time() - begun
+            gone = after.k - at.k
+            done.gone.setdefault(at.k, []).append(gone)
+            done.rounds, done.rows = done.rounds + 1, done.rows + asked
+            done.drafts += sum(self._deviations[k] > 0 for k in range(at.k, after.k))
+            done.taken, at = done.taken + after.taken, after
+        return at.sample
+
+    def _round(self, contexts: Contexts, at: Checked, draft: Draft, steps: range, drawn: Drawn) -> Checked:
+        """Draft the samples after these steps, and check them."""
+        samples, means, prediction, taken = [at.sample], list[Tensor](), at.prediction, 0
+        for step in steps:
+            means.append(moved_on(self._sampler, samples[-1], draft(samples[-1], step, prediction), step))
+            samples.append(means[-1] + self._deviations[step] * drawn.noise[step])
+        found, sample = self._many.outputs(samples[:-1], steps, contexts), at.sample
+        for place, step in enumerate(steps):
+            prediction, deviation = found[place], self._deviations[step]
+            wanted = moved_on(self._sampler, samples[place], prediction, step)
+            chance = float(drawn.chance[step])
+            sample, drafted = settled(wanted, means[place], drawn.noise[step], deviation, chance)
+            taken += drafted and deviation > 0
+            if not drafted:
+                break
+        return Checked(sample, step + 1, prediction, taken)
+
+    def plain(self, contexts: Contexts, initial: Tensor, drawn: Drawn, done: Done) -> Tensor:
         """The same without drafts."""
-        begun, sample = perf_counter(), initial
+        begun, sample = process_time(), initial
         for k in range(self._steps):
             mean = moved_on(self._sampler, sample, output_of(self._model, sample, k, contexts), k)
-            sample = self._noisy(mean, k)
+            sample = mean + self._deviations[k] * drawn.noise[k]
         done.rounds, done.rows = done.rounds + self._steps, done.rows + self._steps
-        done.seconds += perf_counter() - begun
+        done.seconds += process_time() - begun
         return sample
-
-    def _noisy(self, mean: Tensor, k: int) -> Tensor:
-        return mean + float(self._table.noise_to_next[k]) * torch.randn(mean.shape, generator=self._draw)
-
-
-@torch.no_grad()
-def predictions(runner: Runner, calls: Calls) -> tuple[Tensor, Tensor]:
-    """Samples and predictions at each step of dense calls, ``[K, N, T, D]`` both."""
-    model, sampler, carried = runner.model, runner.model.sampler, runner.model.sampler.begin(calls.initial)
-    samples, found = list[Tensor](), list[Tensor]()
-    for k in range(model.steps):
-        samples.append(carried.sample)
-        found.append(output_of(model, carried.sample, k, calls.contexts))
-        carried = Carried(*sampler.advance(carried, found[-1], None if calls.noise is None else calls.noise[k], k))
-    return torch.stack(samples), torch.stack(found)
-
-
-def trained(runner: Runner, calls: Calls, ahead: int, updates: int, seed: int) -> Drafter:
-    """A drafter that learned from dense calls what the network says up to so many steps after its last prediction."""
-    samples, found = predictions(runner, calls)
-    features = runner.model.condition(calls.contexts)
-    steps, count = samples.shape[:2]
-    torch.manual_seed(seed)
-    drafter = Drafter((samples.shape[2], samples.shape[3]), steps, features.shape[1])
-    optimizer = torch.optim.AdamW(drafter.parameters(), RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, updates))
-    for _ in range(updates):
-        k, call = torch.randint(1, steps, (BATCH,)), torch.randint(count, (BATCH,))
-        before = (k - torch.randint(1, ahead + 1, (BATCH,))).clamp(min=0)
-        wrong = drafter(samples[k, call], k, found[before, call], features[call]) - found[k, call]
-        loss = wrong.square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-    return drafter.eval()
 
 
 @dataclass(frozen=True)
@@ -221,7 +201,7 @@ class Row:
     """One drafter, and how many steps are checked at once.
 
     Attributes:
-        ahead: steps; 1 is the loop without drafts.
+        ahead: how many steps a round checks.
         taken: share of the drafts.
         rounds: evaluations of the network in a call, of several rows each.
         rows: of these, in a call.
@@ -229,7 +209,7 @@ class Row:
     """
 
     drafter: str
-    ahead: int
+    ahead: str
     taken: float
     rounds: float
     rows: float
@@ -237,32 +217,65 @@ class Row:
 
 
 @torch.no_grad()
-def measured(runner: Runner, calls: Calls, drafter: Drafter, ahead: Sequence[int], seed: int) -> list[Row]:
-    """The loop without drafts, and each drafter with each number of steps, on the same calls in turn."""
-    many, features = ManySteps(runner.view), runner.model.condition(calls.contexts)
-    ways = [("none", 1), *((name, count) for name in ("the last prediction", "a small network") for count in ahead)]
+def measured(
+    runner: Runner, calls: Calls, drafter: Drafter, ahead: Sequence[int], learned: Calls, seed: int
+) -> list[Row]:
+    """The loop without drafts, and each drafter with each way to say how many, on the same calls in turn."""
+    loop, features = Speculating(runner, ManySteps(runner.view)), runner.model.condition(calls.contexts)
+    most = max(ahead)
+    counts = {str(count): fixed(count) for count in ahead}
+    schedulers = {
+        "as the last round says": after_the_last(most),
+        "as the step says": rounds_of(loop, runner, learned, drafter, (1, *ahead), seed),
+        "as will be taken": that_will_be_taken(most),
+    }
+    ways = [("none", "1", fixed(1)), *(("the last prediction", *one) for one in counts.items())]
+    ways += [("a small network", *one) for one in (counts | schedulers).items()]
     done = [Done() for _ in ways]
-    loops = [Speculating(runner, many, seed) for _ in ways]
     for number in range(calls.count):
-        one = runner.select(calls, [number])
-
-        def small(sample: Tensor, k: int, last: Tensor, own: Tensor = features[number : number + 1]) -> Tensor:
-            found: Tensor = drafter(sample, torch.tensor([k]), last, own)
-            return found
-
-        for (name, count), loop, told in zip(ways, loops, done, strict=True):
+        one, small = runner.select(calls, [number]), drafting(drafter, features[number : number + 1])
+        drawn = Drawn.of(runner.model.steps, one.initial, seed + number)
+        for (name, _, said), told in zip(ways, done, strict=True):
             if name == "none":
-                loop.plain(one.contexts, one.initial, told)
+                loop.plain(one.contexts, one.initial, drawn, told)
             else:
-                loop.call(one.contexts, one.initial, small if name == "a small network" else _last, count, told)
-    return [_row(name, count, told, calls.count) for (name, count), told in zip(ways, done, strict=True)]
+                draft = small if name == "a small network" else _last
+                loop.call(one.contexts, one.initial, draft, said, drawn, told)
+    return [_row(name, count, told, calls.count) for (name, count, _), told in zip(ways, done, strict=True)]
+
+
+def rounds_of(
+    loop: Speculating, runner: Runner, calls: Calls, drafter: Drafter, counts: Sequence[int], seed: int
+) -> Ahead:
+    """What rounds of other calls say about each step: how far the longest went, and what those of each length took."""
+    features, gone, seconds = runner.model.condition(calls.contexts), Done().gone, dict[int, float]()
+    for number in range(calls.count):
+        one, small = runner.select(calls, [number]), drafting(drafter, features[number : number + 1])
+        drawn = Drawn.of(runner.model.steps, one.initial, seed - 1 - number)
+        for count in counts if number < TIMED else (max(counts),):
+            told = Done()
+            loop.call(one.contexts, one.initial, small, fixed(count), drawn, told)
+            seconds[count] = min(seconds.get(count, np.inf), told.seconds / told.rounds)
+        for step, some in told.gone.items():
+            gone.setdefault(step, []).extend(some)
+    return by_step(gone, seconds)
+
+
+def drafting(drafter: Drafter, features: Tensor) -> Draft:
+    """The small network, for an observation."""
+
+    def small(sample: Tensor, k: int, last: Tensor) -> Tensor:
+        found: Tensor = drafter(sample, torch.tensor([k]), last, features)
+        return found
+
+    return small
 
 
 def _last(sample: Tensor, k: int, last: Tensor) -> Tensor:
     return last
 
 
-def _row(name: str, ahead: int, done: Done, calls: int) -> Row:
+def _row(name: str, ahead: str, done: Done, calls: int) -> Row:
     taken = done.taken / done.drafts if done.drafts else 0.0
     return Row(name, ahead, taken, done.rounds / calls, done.rows / calls, 1000 * done.seconds / calls)
 
@@ -309,14 +322,15 @@ def main(
         given.append(prepare_calls(runner.model, spec, episodes, chosen, (seed, 23, stage)))
     say(progress(), f"a drafter learns from {given[0].count} calls")
     drafter = trained(runner, given[0], max(drafts), updates, seed)
-    rows = measured(runner, given[1], drafter, drafts, seed)
+    told_by = runner.select(given[0], range(min(TOLD, given[0].count)))
+    rows = measured(runner, given[1], drafter, drafts, told_by, seed)
     if as_json:
         print_json({"calls": given[1].count, "rows": [asdict(row) for row in rows]})
         return
     told = table("drafter", "at once", "drafts taken", "evaluations", "rows", "ms a call")
     for row in rows:
-        counts = (f"{row.taken:.1%}" if row.ahead > 1 else "", f"{row.rounds:.1f}", f"{row.rows:.1f}", f"{row.ms:.0f}")
-        told.add_row(row.drafter, str(row.ahead), *counts)
+        taken = "" if row.drafter == "none" else f"{row.taken:.1%}"
+        told.add_row(row.drafter, row.ahead, taken, f"{row.rounds:.1f}", f"{row.rows:.1f}", f"{row.ms:.0f}")
     results_console().print(told)
     say(results_console(), f"{given[1].count} calls of episodes that nothing was learned from, each of one stream.")
 
