@@ -14,10 +14,12 @@ there: there is no other way. Of the last layer nothing else is computed anyway,
 **Image tokens:** the first layer has all of them. What all words give one there, mean over heads, is its relevance. The
 ``KEY`` most relevant are kept; half of the others that are kept are the next by relevance, half are those least similar
 to the ``KEY``. The expert sees what is left from the second layer on, and all tokens keep their positions. Variants
-called ``even`` choose nothing: they keep every second or fourth token.
+called ``even`` choose nothing: they keep every second or fourth token. Those called ``edges`` choose as SP-VLA does
+(arXiv 2506.12723): half of the tokens that are kept are the most relevant ones, and half those of the other patches
+whose pixels differ most from their neighbours. There edges are Canny's, and more tokens go while the robot is fast.
 
-From the paper (arXiv 2506.10100) this differs: its action head reads one token after the last layer, and no others; and
-its language model is a Llama 2, with eight times the layers. ``KEY`` and the two halves are our own numbers.
+EfficientVLA's own action head reads one token after the last layer, and no others; and its language model is a Llama 2,
+with eight times the layers (arXiv 2506.10100). ``KEY`` and the two halves are our own numbers.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
+from math import isqrt
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +54,9 @@ from ttscompile.runtimes.random_calls import normalized
 KEY = 4
 """Tokens that are kept first, by relevance alone."""
 
-Rule = Callable[[Tensor, Tensor, int], Tensor]
-"""Of image tokens' relevance ``[B, N]``, themselves ``[B, N, width]``, and how many are kept: which, ``[B, count]``."""
+Rule = Callable[[Tensor, Tensor, Tensor, int], Tensor]
+"""Of image tokens' relevance ``[B, N]``, themselves ``[B, N, width]``, how steep their patches are ``[B, N]``, and how
+many are kept: which, ``[B, count]``."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,7 @@ class ShorterPrefix(Prefix):
                 own = late
             if number == 0 and self.kept is not None and self.kept < count:
                 relevant = relevance(layer.self_attn, layer.input_layernorm(before), keys, turns, seen_by, mask)
-                index = self.rule(relevant, x[:, :count], self.kept)
+                index = self.rule(relevant, x[:, :count], steepness(images, count), self.kept)
                 x, positions, still = (with_some(each, index, count) for each in (x, positions, still))
         return _and_own(valid), _and_own(still), *found
 
@@ -166,19 +170,39 @@ def relevance(
     return (given * mask[:, :, None]).sum(1)
 
 
-def chosen(relevant: Tensor, tokens: Tensor, count: int) -> Tensor:
+def steepness(images: Sequence[Tensor], count: int) -> Tensor:
+    """Of pictures ``[B, 3, H, W]`` the mean of Sobel's magnitude in the patch of each token, ``[B, count]``."""
+    grey, side = torch.stack(list(images), 1).mean(2), isqrt(count // len(images))
+    rows = grey[:, :, :-2] + 2 * grey[:, :, 1:-1] + grey[:, :, 2:]
+    columns = grey[..., :-2] + 2 * grey[..., 1:-1] + grey[..., 2:]
+    across, down = rows[..., 2:] - rows[..., :-2], columns[:, :, 2:] - columns[:, :, :-2]
+    steep = functional.pad((across**2 + down**2).sqrt(), (1, 1, 1, 1))
+    return steep.unflatten(3, (side, -1)).unflatten(2, (side, -1)).mean((3, 5)).flatten(1)
+
+
+def chosen(relevant: Tensor, tokens: Tensor, _: Tensor, count: int) -> Tensor:
     """By relevance, and then the least similar to the first ones."""
     key = min(KEY, count)
     best = relevant.topk(key + (count - key) // 2, 1).indices
     unit = functional.normalize(tokens, dim=2)
     first = unit.gather(1, best[:, :key, None].expand(-1, -1, unit.shape[2]))
     far = 1 - (unit @ first.transpose(1, 2)).amax(2)
-    known = (best[:, :, None] == torch.arange(tokens.shape[1], device=tokens.device)).any(1)
-    others = torch.where(known, -1.0, far).topk(count - best.shape[1], 1).indices
-    return torch.cat([best, others], 1)
+    return torch.cat([best, _best_of_others(far, best, count)], 1)
 
 
-def even(relevant: Tensor, tokens: Tensor, count: int) -> Tensor:
+def edged(relevant: Tensor, tokens: Tensor, steep: Tensor, count: int) -> Tensor:
+    """Half by relevance, and half of the others by edges."""
+    best = relevant.topk(count - count // 2, 1).indices
+    return torch.cat([best, _best_of_others(steep, best, count)], 1)
+
+
+def _best_of_others(worth: Tensor, known: Tensor, count: int) -> Tensor:
+    """Of worth ``[B, N]``, none below 0, the best beside those that are known, so that there are ``count``."""
+    taken = (known[:, :, None] == torch.arange(worth.shape[1], device=worth.device)).any(1)
+    return torch.where(taken, -1.0, worth).topk(count - known.shape[1], 1).indices
+
+
+def even(relevant: Tensor, tokens: Tensor, _: Tensor, count: int) -> Tensor:
     """Always the same ones, evenly spaced."""
     return (torch.arange(count, device=tokens.device) * tokens.shape[1] // count)[None].expand(len(tokens), -1)
 
@@ -260,7 +284,7 @@ def main(
     made: dict[str, tuple[tuple[int, ...], int | None, Rule]] = {"whole": ((), None, chosen)}
     made |= {f"layers-{count}": (most_similar(similar, count), None, chosen) for count in counts}
     made |= {f"tokens-{kept}": ((), kept, chosen) for kept in tokens}
-    made |= {f"even-{kept}": ((), kept, even) for kept in tokens}
+    made |= {f"{name}-{kept}": ((), kept, rule) for name, rule in (("even", even), ("edges", edged)) for kept in tokens}
     both = zip(counts, tokens, strict=False)
     made |= {f"layers-{count}-tokens-{kept}": (most_similar(similar, count), kept, chosen) for count, kept in both}
     for name, variant in made.items():

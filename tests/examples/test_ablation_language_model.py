@@ -79,8 +79,21 @@ def test_kept_are_those_with_most_attention_and_those_unlike_them() -> None:
     relevant = ablation.relevance(attention, normed, keys, still, seen_by, mask)
     torch.testing.assert_close(relevant[0], (keys[0, 0, :, 1] / 2**0.5).softmax(0)[:8])
     tokens[0, [2, 7]] = torch.tensor([[1.0, -1.0], [-1.0, -1.0]])
-    assert ablation.chosen(relevant, tokens, 6).tolist() == [[1, 3, 4, 6, 7, 2]]
-    assert ablation.even(relevant, tokens, 4).tolist() == [[0, 2, 4, 6]]
+    steep = torch.tensor([[0.1, 0.9, 0.4, 0.2, 0.0, 0.3, 0.0, 0.8]])
+    assert ablation.chosen(relevant, tokens, steep, 6).tolist() == [[1, 3, 4, 6, 7, 2]]
+    assert ablation.edged(relevant, tokens, steep, 5).tolist() == [[1, 3, 4, 7, 2]]
+    assert ablation.even(relevant, tokens, steep, 4).tolist() == [[0, 2, 4, 6]]
+
+
+def test_patches_with_edges_are_steep_and_in_the_order_of_their_tokens() -> None:
+    """A ramp across is as steep everywhere; an edge is in the patch that it is in, whichever way it goes."""
+    ramp, edge = (torch.arange(16.0) / 8).expand(2, 3, 16, 16), torch.zeros(2, 3, 16, 16)
+    edge[0, :, 4:8, 6:], edge[1, :, 9:, 8:12] = 1, 1
+    steep = ablation.steepness([ramp, edge], 32)
+    assert steep.shape == (2, 32)
+    torch.testing.assert_close(steep[:, [5, 6, 9, 10]], torch.ones(2, 4))  # 8 times the difference of neighbours
+    assert steep[0, 16:].argmax() == 5 and steep[1, 16:].argmax() in (8 + 2, 12 + 2)
+    assert steep[0, 28:].tolist() == [0.0] * 4  # far from it
 
 
 def test_what_is_left_out_is_as_if_nobody_saw_it(policy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
