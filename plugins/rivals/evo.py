@@ -1,14 +1,15 @@
 """EVO: a genetic search over the cells, with the true error of the executed actions as fitness.
 
 Source: arXiv 2607.20293, whose fitness is the success of rollouts; here it is the error against the dense policy on
-recorded calls, which needs no simulator. Population 30, tournaments of 3, crossover 0.8, mutation 0.1, and at least 4
-computed cells a block, as there; every plan has exactly as many computed cells as the budget. An interval is a
-generation. The first has random plans and the whole-step plans of ``crowded``, and the best plan always survives.
+recorded calls, which needs no simulator (``examples/evaluation/evolved.py`` has both). Population 30, tournaments of 3,
+crossover 0.8, mutation 0.1, and at least 4 computed cells a block, as there; every plan has exactly as many computed
+cells as the budget. An interval is a generation. The first has random plans and the whole-step plans of ``crowded``,
+and the best plan always survives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -29,13 +30,24 @@ LEAST = 4
 """Computed cells a block, if the budget has room for them."""
 
 
+Fitness = Callable[[PlanArray], float]
+"""Of a schedule ``[K, blocks]``; the smaller the better."""
+
+
 class Evo(NothingAfter):
-    """The genetic search of this module; see ``Search``."""
+    """The genetic search of this module; see ``Search``.
+
+    Args:
+        fitness: None for the error.
+        population: schedules of a generation.
+    """
 
     intervals = GENERATIONS
 
-    def __init__(self, task: Task) -> None:
-        self._task = task
+    def __init__(self, task: Task, fitness: Fitness | None = None, population: int = POPULATION) -> None:
+        self._task, self._size = task, population
+        measured = some_calls(task, MEASURED)
+        self._fitness = fitness or (lambda plan: task.error(plan, measured))
         model = task.runner.model
         self._least = min(LEAST, task.budget // model.blocks)
         self._population: BoolArray = self._first()
@@ -48,7 +60,7 @@ class Evo(NothingAfter):
 
     @property
     def loss(self) -> float:
-        """Error of the best schedule on the calls that all plans are compared on."""
+        """Fitness of the best schedule: the error on the calls that all plans are compared on."""
         return float(self._errors.min()) if self._interval else float("nan")
 
     def advance(self, interval: int) -> None:
@@ -85,13 +97,14 @@ class Evo(NothingAfter):
         draw = task.draw(10**6)
         family = spacings(model.steps, max(1, task.budget // model.blocks))
         whole = [whole_steps_plan(model.steps, model.blocks, steps) == Source.COMPUTE for steps in family]
-        random = draw.random((POPULATION - len(whole), *whole[0].shape)) < task.budget / whole[0].size
+        whole = whole[: self._size]
+        random = draw.random((self._size - len(whole), *whole[0].shape)) < task.budget / whole[0].size
         return np.stack([repair(one, task.budget, self._least, draw) for one in (*whole, *random)])
 
     def _children(self, draw: np.random.Generator) -> BoolArray:
         """All of the next generation but the best of this one."""
         children = []
-        for _ in range(POPULATION - 1):
+        for _ in range(self._size - 1):
             rivals = [draw.integers(len(self._population), size=TOURNAMENT) for _ in range(2)]
             first, second = (self._population[some[np.argmin(self._errors[some])]] for some in rivals)
             child = first.copy()
@@ -103,10 +116,10 @@ class Evo(NothingAfter):
         return np.stack(children)
 
     def _measure(self, computed: BoolArray) -> Array:
-        """Mean error of each plan; infinite where there was no time for it."""
-        calls, errors = some_calls(self._task, MEASURED), np.full(len(computed), np.inf)
+        """Fitness of each plan; infinite where there was no time for it."""
+        errors = np.full(len(computed), np.inf)
         for i in self._task.clock.in_time(range(len(computed))):
-            errors[i] = self._task.error(_plan(computed[i]), calls)
+            errors[i] = self._fitness(_plan(computed[i]))
         return errors
 
 

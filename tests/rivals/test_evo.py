@@ -9,6 +9,7 @@ from hypothesis import given, strategies as st
 from tests.calibration.tasks import MakeTask
 from tests.rounding import Counted, allowed
 from ttscompile.calibration.step_counts import spacings
+from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.rivals.evo import POPULATION, Evo, mutate, repair
 
 
@@ -61,3 +62,16 @@ def test_generations_get_better_and_begin_with_whole_steps(make_task: MakeTask) 
     with Counted() as counted:
         found = task.error(search.plan, task.calls)
     assert found == pytest.approx(losses[-1], abs=allowed(task.calls.targets, counted.terms))
+
+
+def test_a_fitness_of_the_callers_is_what_gets_better(make_task: MakeTask) -> None:
+    def late(plan: PlanArray) -> float:
+        return -float((plan[6:] == Source.COMPUTE).sum())
+
+    search, losses = Evo(make_task(26), late, 8), []
+    for generation in range(5):
+        search.advance(generation)
+        losses.append(search.loss)
+    assert search._population.shape == (8, 10, 6)
+    assert losses == sorted(losses, reverse=True) and losses[-1] < losses[0]
+    assert search.loss == late(search.plan) == late(search.found().schedule)
