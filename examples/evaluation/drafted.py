@@ -252,11 +252,11 @@ def rounds_of(
     for number in range(calls.count):
         one, small = runner.select(calls, [number]), drafting(drafter, features[number : number + 1])
         drawn = Drawn.of(runner.model.steps, one.initial, seed - 1 - number)
-        for count in counts if number < TIMED else (max(counts),):
+        for count in sorted(counts) if number < TIMED else (max(counts),):
             told = Done()
             loop.call(one.contexts, one.initial, small, fixed(count), drawn, told)
             seconds[count] = min(seconds.get(count, np.inf), told.seconds / told.rounds)
-        for step, some in told.gone.items():
+        for step, some in told.gone.items():  # of the longest rounds
             gone.setdefault(step, []).extend(some)
     return by_step(gone, seconds)
 

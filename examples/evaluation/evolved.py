@@ -132,8 +132,8 @@ def main(
     beside = summarise("episodes", named["episodes"].rollout, named["error"].rollout)
     if as_json:
         rows = [one.to_json() | {"episodes": None} for one in told]
-        difference = [beside.score_difference, beside.success_difference]
-        print_json({"rows": rows, "beside_error": difference, "seconds_a_generation": costs, "budget": budget})
+        against_error = {name: beside.to_json()[name] for name in ("score_difference", "success_difference")}
+        print_json({"rows": rows, "against_error": against_error, "seconds_a_generation": costs, "budget": budget})
         return
     show(told, beside, costs, seeds, f"{environment}, {budget} of {runner.model.steps * runner.model.blocks} cells")
 
