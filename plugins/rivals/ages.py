@@ -171,9 +171,7 @@ def fit_table(task: Task, criterion: Criterion) -> Tabled:
     """
     runner, calls = task.runner, task.calls
     if len(np.unique(calls.episodes)) < 2:
-        raise CalibrationError(
-            "corrections are judged on episodes that they are not fitted on; record more than one."
-        )
+        raise CalibrationError("corrections are judged on episodes that they are not fitted on; record more than one.")
     apart = np.isin(calls.episodes, np.unique(calls.episodes)[::QUARTERS])
     fitted, judged = (runner.select(calls, np.flatnonzero(some)) for some in (~apart, apart))
     reads = task.whole.reads(max(1, task.budget // runner.model.blocks))

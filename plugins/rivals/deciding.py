@@ -87,12 +87,14 @@ class Deciding:
         work = backend.workspace
         assert work is not None  # ``prepare``
         decisions, rows = Decisions(self._criterion, steps, blocks, streams), list[PlanArray]()
-        read, age = None if correction is None else correction.read(work.condition()), 0
+        read, age = np.zeros((streams, 0), np.float32), 0
+        if correction is not None and correction.reads:
+            read = correction.read(work.condition())
         work.begin()
         for k in range(steps):
             rows.append(self._step(work, k, decisions))
             age = 0 if rows[-1][0, -1] == Source.COMPUTE else age + 1
-            if read is not None and age:
+            if correction is not None and age:
                 self._advance(work, k, min(age, len(self._table) - 1), read)
             else:
                 work.advance(k)

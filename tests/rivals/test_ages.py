@@ -75,14 +75,15 @@ def test_where_all_calls_decide_alike_they_are_those_of_the_schedule(runner: Run
     assert_equal_but_for_rounding(found, expected, 100 * counted.terms)
 
 
+@pytest.mark.parametrize("reads", [False, True])
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_a_call_answers_as_the_loop_in_which_they_were_fitted(
-    artifact: Artifact, runner: Runner, made: Made, rule: Criterion, monkeypatch: pytest.MonkeyPatch
+    artifact: Artifact, runner: Runner, made: Made, rule: Criterion, reads: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ages, "LEAST", 20)
     (fitted, *_), (others, obs, noise) = made(FITTED, 1), made(OTHERS, 2)
     with Counted() as counted:
-        table, expected = fit_ages(runner, rule, fitted, others, reads=True)
+        table, expected = fit_ages(runner, rule, fitted, others, reads)
     weights = np.stack([one.weights for one in table])
     assert len(table) > 1 and (weights[1:] != weights[0]).any()  # ages differ
     assert [bool(one.anchors.all()) for one in table] == [True] + [False] * (len(table) - 1)
