@@ -5,10 +5,10 @@
 A criterion (TeaCache, DBCache) is fitted to recorded calls for each share of reused cells. Then it answers held-out
 calls twice: it decides at each step what to compute (``ttscompile.rivals.deciding``), and as the one plan that
 calibration freezes it into. It does both once more with corrections, if they are better: that of the plan, and, where
-it decides, those for each step and for how long ago one was computed (``ttscompile.rivals.ages``). Beside these stand
-what other proposers find for the same shares, and the plans of the artifact. All take turns on one thread of
-onnxruntime, so that errors can be compared at equal milliseconds. Errors are against the same loop with every step
-computed, and the same noise. Nothing is written.
+it decides, those for each step and for how long ago one was computed (``ages``). Beside these stand what other
+proposers find for the same shares, and the plans of the artifact. All take turns on one thread of onnxruntime, so that
+errors can be compared at equal milliseconds. Errors are against the same loop with every step computed, and the same
+noise. Nothing is written.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import click
 import numpy as np
 import numpy.typing as npt
 import torch
+from ages import fit_table
 from rivals import default_sparsities
 from searches import plan_of
 
@@ -55,8 +56,7 @@ from ttscompile.core.spec import FloatArray, Noise, PolicySpec
 from ttscompile.errors import CalibrationError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Timer
-from ttscompile.rivals.ages import Table, fit_table
-from ttscompile.rivals.deciding import Deciding
+from ttscompile.rivals.deciding import Deciding, Table
 from ttscompile.rivals.online import Criterion
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.random_calls import Observation, normalized

@@ -18,6 +18,7 @@ import numpy as np
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import view_of
+from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 from ttscompile.core.plan import Plan
 from ttscompile.core.spec import FloatArray, Noise
@@ -27,8 +28,10 @@ from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.sessions import Sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 
-from .ages import Table
 from .online import Criterion, Decisions
+
+Table = tuple[Correction, ...]
+"""By *age*: how many steps ago one was computed whole. A stream of a greater age takes the last one."""
 
 
 class Deciding:
@@ -37,7 +40,7 @@ class Deciding:
     Args:
         plan: whose loop, weights and precision the calls have; its cells and its correction are not read.
         threads: of arithmetic.
-        table: corrections by age, see ``ages``; empty for none.
+        table: corrections by age, which ``examples/benchmark/ages.py`` fits; empty for none.
 
     Raises:
         RuntimeUnavailableError: onnxruntime is missing.

@@ -29,12 +29,9 @@ from ttscompile.calibration.task import Task
 from ttscompile.core.correction import Correction, components_of, groups_of, numbers_of
 from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError
+from ttscompile.rivals.deciding import Table
+from ttscompile.rivals.online import Criterion, decide, deciding_blocks
 from ttscompile.runtimes.reference.sampler import Carried, features
-
-from .online import Criterion, decide, deciding_blocks
-
-Table = tuple[Correction, ...]
-"""By age; a stream of a greater age takes the last one."""
 
 LEAST = 160
 """Calls of an age at a step, from which on it has a correction of its own: features and components are as many."""

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import ages
 import numpy as np
 import pytest
 import torch
+from ages import fit_ages, fit_table
 
 from tests.calibration.tasks import make_task
+from tests.rivals.rules import RULES
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
@@ -21,12 +24,8 @@ from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import Noise
 from ttscompile.errors import CalibrationError
-from ttscompile.rivals import ages
-from ttscompile.rivals.ages import fit_ages, fit_table
 from ttscompile.rivals.deciding import Deciding
 from ttscompile.rivals.online import Criterion, decide
-
-from .rules import RULES
 
 FITTED, OTHERS = 120, 6
 
