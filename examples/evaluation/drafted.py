@@ -158,7 +158,10 @@ class Speculating:
             def checked(count: int, at: Checked = at, left: int = left) -> Checked:
                 return self._round(contexts, at, draft, range(at.k, at.k + min(count, left)), drawn)
 
-            asked = min(left, ahead(Place(at.k, asked, gone, lambda count, at=at: checked(count).k - at.k)))
+            def peek(count: int, checked: Callable[[int], Checked] = checked, k: int = at.k) -> int:
+                return checked(count).k - k
+
+            asked = min(left, ahead(Place(at.k, asked, gone, peek)))
             begun, after = process_time(), checked(asked)
             done.seconds += process_time() - begun
             gone = after.k - at.k
