@@ -29,10 +29,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ttscompile.calibration.calls import Calls, FloatArray
+from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.runner import Runner, StreamCaches, last
 from ttscompile.calibration.task import Array, Found, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
+from ttscompile.core.spec import FloatArray
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
 from ttscompile.runtimes.reference.model import Blocks
 

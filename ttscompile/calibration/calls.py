@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..core.spec import FloatArray as FloatArray, PolicySpec
+from ..core.spec import FloatArray, PolicySpec
 from ..core.tokenizer import ReadTokenizer
 from ..errors import CalibrationError
 from ..measure.points import LARGEST
